@@ -1,0 +1,266 @@
+"""False alarms and power of the diagnosis on simulated campaigns.
+
+    python benchmarks/trace_study.py clean   --count 400     model exactly as declared
+    python benchmarks/trace_study.py effects --count 600     one or two effects the model lacks
+    python benchmarks/trace_study.py leftout --count 200     one effect that no candidate names
+
+Campaigns come from the simulated rig's own physics (random rigs, 30 to 80 dB noise, white or
+coloured, 4 to 16 runs); the diagnosis sees arrays only. Prints verdicts, wrong claims, a confusion
+table by effect, how often 95 % intervals of traced effects hold the truth and what validation is
+left, and writes one JSON line a campaign to `--out`; `--again FILE` reports on such lines alone.
+"""
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import identify
+from identify.effects import CANDIDATES
+from identify.record import Campaign, DeclaredModel, Medium, Run, Signal
+from simulated_rig.campaigns import SimulatedCampaign, simulate_campaign
+from simulated_rig.effects import EFFECTS
+from simulated_rig.random_rigs import random_campaign, random_rig
+
+Truth = dict[str, float]
+
+
+def _time(t: Truth) -> float:
+    return 1 / (2 * np.pi * t["pole_hz"])
+
+
+# (effect, form claimed, variant simulated): parameters of which both sides speak, and their truth.
+# Drifts are simulated over 1200 s and claimed over the campaign, 120 s a run.
+COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, int], float]]] = {
+    ("flame_delay", "", ""): {"delay_s": lambda t, n: t["delay_s"]},
+    ("flame_dynamics", "pole", "extra_pole"): {"time_s": lambda t, n: _time(t)},
+    ("actuator_dynamics", "pole", "voice_coil"): {"time_s": lambda t, n: _time(t)},
+    ("actuator_dynamics", "delay", "delay"): {"delay_s": lambda t, n: t["delay_s"]},
+    ("actuator_dynamics", "resonance", "resonance"): {
+        "frequency_hz": lambda t, n: t["resonance_hz"],
+        "damping": lambda t, n: t["damping"],
+    },
+    ("acoustic_mode", "", ""): {
+        "frequency_hz": lambda t, n: t["frequency_hz"],
+        "damping": lambda t, n: t["damping"],
+    },
+    ("actuator_nonlinearity", "quadratic", "distortion"): {"a2": lambda t, n: t["quadratic_per_v"]},
+    ("actuator_nonlinearity", "cubic", "compression"): {"a3": lambda t, n: -t["cubic_per_v2"]},
+    ("channel_mismatch", "skew", "skew"): {"skew_s": lambda t, n: -t["skew_s"]},
+    **{
+        ("parameter_drift", what, what): {
+            "relative_change": lambda t, n, what=what: t[f"{what}_change"] * (n - 1) / 10
+        }
+        for what in ("frequency", "damping", "flame_gain", "speaker_gain")
+    },
+}
+
+# Effects of the same physics under another name: a side resonator is one more mode of the tube.
+SAME = {"side_resonator": "acoustic_mode"}
+
+
+def to_campaign(c: SimulatedCampaign) -> Campaign:
+    """The simulated recordings as identification takes them."""
+    step = 2 * c.full_scale_v / 2**c.bits
+    runs = []
+    for r in c.runs:
+        signals = {
+            name: Signal(x, "pressure", "Pa", position, c.full_scale_v / volts, step / volts)
+            for name, x, position, volts in zip(
+                ("p1", "p2"), (r.p1, r.p2), c.positions_m, c.volts_per_pa, strict=True
+            )
+        }
+        signals["drive"] = Signal(r.drive, "voltage", "V", None, c.full_scale_v, step)
+        runs.append(
+            Run(
+                r.name,
+                r.plan.kind,
+                c.sample_rate_hz,
+                signals,
+                r.plan.frequency_hz,
+                r.plan.amplitude_v,
+                r.plan.started_s,
+                r.plan.role,
+            )
+        )
+    medium = Medium(c.density_kg_m3, c.sound_speed_m_s)
+    return Campaign(c.title, tuple(runs), medium, DeclaredModel(modes=c.declared_modes), c.title)
+
+
+def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
+    """Simulate and diagnose one campaign."""
+    mode, seed, only = task
+    rng = np.random.default_rng([seed, 71])
+    record: dict[str, Any] = {"seed": seed, "mode": mode}
+    rig = random_rig(
+        seed, noise_db=(30.0, 80.0), coloured=bool(rng.uniform() < 0.3), modes=(1, 2, 2, 2, 3)
+    )
+    modes = len(rig.plant.modes)
+    effects = []
+    if mode != "clean":
+        keys = [k for k in EFFECTS if only is None or k.startswith(only)]
+        count = 1 if only or mode == "leftout" or rng.uniform() < 0.8 else 2
+        for key in rng.choice(keys, size=count, replace=False):
+            effects.append(EFFECTS[str(key)].draw(rng, float(rng.uniform())))
+    forced = int(rng.integers(3, 13)) if mode == "clean" else int(rng.integers(7, 11))
+    try:
+        rig, plan = random_campaign(
+            seed, rig, effects, forced=forced, validation=min(3, max(1, forced // 3)),
+            cold=int(rng.uniform() < 0.2),
+        )  # fmt: skip
+        campaign = to_campaign(simulate_campaign(rig, plan, seed, declared_modes=modes))
+    except ValueError as error:
+        return {**record, "skipped": str(error)}
+    record["truth"] = [
+        {"effect": SAME.get(e.name, e.name), "variant": e.variant, "location": e.location,
+         "parameters": {k: v["value"] for k, v in e.parameters().items()}}
+        for e in effects
+    ]  # fmt: skip
+    record["modes"], record["runs"] = modes, len(campaign.runs)
+    began = time.process_time()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            missing = {t["effect"] for t in record["truth"]} if mode == "leftout" else set()
+            left = [e for e in CANDIDATES if e.name not in missing]
+            d = identify.diagnose(campaign, catalogue=left)
+    except Exception as error:
+        return {**record, "error": f"{type(error).__name__}: {error}"}
+    record |= {
+        "cpu_s": time.process_time() - began,
+        "verdict": d.verdict,
+        "claimed": [
+            {"effect": e.effect, "form": e.form, "location": e.location,
+             "parameters": {n: [v.value, v.stderr] for n, v in e.parameters.items()}}
+            for e in d.effects
+        ],
+        "best": [list(c.effects) for c in d.candidates[:4]],
+        "where": [list(c.locations) for c in d.candidates[:1]],
+        "converged": d.before.fit.converged,
+        "chi2": [d.before.chi2_per_dof, d.after.chi2_per_dof],
+        "dof": d.before.dof,
+        "p": d.residual.p_value,
+        "validation": [d.before.validation_error, d.after.validation_error, d.noise_floor],
+        "quality": sorted({f"{q.flag}:{q.severity}" for q in d.quality}),
+    }  # fmt: skip
+    return record
+
+
+def outcome(r: dict[str, Any]) -> str:
+    """right, right in part (the rest is below the noise), wrong, ambiguous (truth among them or
+    not), unexplained or unseen."""
+    truth = sorted({t["effect"] for t in r["truth"]})
+    claimed = sorted({c["effect"] for c in r["claimed"]})
+    if r["verdict"] == "traced":
+        if claimed == truth:
+            return "right"
+        return "right in part" if set(claimed) < set(truth) else "WRONG"
+    if r["verdict"] == "ambiguous":
+        return "ambiguous" if truth in [sorted(b) for b in r["best"]] else "ambiguous, truth out"
+    if r["verdict"] == "unexplained":
+        if r["mode"] != "leftout":
+            return "unexplained"
+        near = {t["location"] for t in r["truth"]} & set(r["where"][0] if r["where"] else ())
+        return "unexplained, right place" if near else "unexplained"
+    return "right" if not truth else "unseen"
+
+
+def deviations(r: dict[str, Any]) -> list[tuple[str, float]]:
+    """(claimed − true)/standard error of the parameters that both sides name; single effects."""
+    if r["verdict"] != "traced" or len(r["truth"]) != 1 or len(r["claimed"]) != 1:
+        return []
+    truth, claim = r["truth"][0], r["claimed"][0]
+    rules = COMPARED.get((claim["effect"], claim["form"], truth["variant"]), {})
+    if claim["effect"] != truth["effect"]:
+        return []
+    out = []
+    for name, rule in rules.items():
+        value, stderr = claim["parameters"][f"{claim['effect']}.{name}"]
+        key = f"{claim['effect']}/{truth['variant']}.{name}"
+        out.append((key, (value - rule(truth["parameters"], r["runs"])) / stderr))
+    return out
+
+
+def intervals(used: list[dict[str, Any]]) -> None:
+    """Coverage of the 95 % intervals, and validation error over noise floor of what was traced."""
+    found = [d for r in used for d in deviations(r)]
+    if found:
+        inside = np.array([abs(z) < 1.96 for _, z in found])
+        print(f"95 % intervals of traced effects' parameters hold the truth: "
+              f"{inside.sum()} of {inside.size} ({100 * inside.mean():.1f} %)")  # fmt: skip
+        for key in sorted({k for k, _ in found}):
+            z = [z for k, z in found if k == key]
+            print(f"    {key:55s} {sum(abs(q) < 1.96 for q in z)} of {len(z)}")
+    left = [
+        r["validation"][1] / r["validation"][2]
+        for r in used
+        if r["verdict"] == "traced" and r["validation"][2]
+    ]
+    if left:
+        print(f"validation error after / noise floor, traced: median {np.median(left):.2f}, "
+              f"95 % below {np.quantile(left, 0.95):.2f}")  # fmt: skip
+
+
+def report(records: list[dict[str, Any]]) -> None:
+    used = [r for r in records if "verdict" in r]
+    print(f"{len(records)} campaigns: {len(used)} diagnosed, "
+          f"{sum('skipped' in r for r in records)} skipped, "
+          f"{sum('error' in r for r in records)} refused or failed")  # fmt: skip
+    for text, n in Counter(r["error"][:100] for r in records if "error" in r).most_common(8):
+        print(f"    {n} × {text}")
+    print("outcomes:", dict(Counter(outcome(r) for r in used)))
+    if not used:
+        return
+    print(f"CPU s a diagnosis: median {np.median([r['cpu_s'] for r in used]):.1f}, "
+          f"largest {max(r['cpu_s'] for r in used):.1f}")  # fmt: skip
+    print("effect (variant): outcomes")
+    table: dict[str, Counter[str]] = {}
+    for r in used:
+        key = " + ".join(sorted(f"{t['effect']}/{t['variant']}" for t in r["truth"])) or "none"
+        table.setdefault(key, Counter())[outcome(r)] += 1
+    for key, row in sorted(table.items()):
+        print(f"    {key:55s} {dict(row)}")
+    intervals(used)
+    for r in used:
+        if outcome(r) == "WRONG":
+            print("wrong:", r["seed"], r["truth"], "claimed", r["claimed"], "χ²/dof", r["chi2"])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("mode", choices=("clean", "effects", "leftout"))
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--only", help="effects whose key starts so")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--again", type=Path, help="report on the lines of an earlier --out")
+    given = parser.parse_args()
+    if given.again is not None:
+        lines = given.again.read_text().splitlines()
+        report([r for r in map(json.loads, lines) if r["mode"] == given.mode])
+        return 0
+    tasks = [(given.mode, s, given.only) for s in range(given.first, given.first + given.count)]
+    records = []
+    with ProcessPoolExecutor(given.jobs) as pool:
+        for i, record in enumerate(pool.map(one, tasks)):
+            records.append(record)
+            if given.out:
+                with given.out.open("a") as file:
+                    file.write(json.dumps(record) + "\n")
+            if sys.stderr.isatty() or (i + 1) % 20 == 0:
+                print(f"{i + 1}/{len(tasks)}", file=sys.stderr)
+    report(records)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Acquisition, entrainment, campaigns, run store, service and command line."""

@@ -1,0 +1,39 @@
+"""What can go wrong in acquisition, campaigns and the run store.
+
+    DaqError
+    ├── InputError         a folder, recording or plan handed in is not usable (ValueError)
+    ├── StoreError         the run store cannot be written or read
+    │   ├── UnknownItem    no campaign or run of that name (also a KeyError)
+    │   └── CorruptFile    a run file is damaged or is not a run file
+    └── CampaignError      a campaign cannot start or go on
+
+Failures of devices are `drivers.errors.DriverError`. A message names the place, the parameter, its
+value and the requirement, then the remedy.
+"""
+
+
+class DaqError(Exception):
+    """Root of the tree."""
+
+
+class InputError(DaqError, ValueError):
+    """Something that was handed in is not usable: the message says what and where."""
+
+
+class StoreError(DaqError):
+    """The run store cannot be written or read."""
+
+
+class UnknownItem(StoreError, KeyError):
+    """No campaign or run of that name."""
+
+    def __str__(self) -> str:
+        return str(self.args[0]) if self.args else ""
+
+
+class CorruptFile(StoreError):
+    """A run file is damaged, or is not a run file."""
+
+
+class CampaignError(DaqError):
+    """A campaign cannot start or cannot go on."""

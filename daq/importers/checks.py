@@ -1,0 +1,65 @@
+"""Recordings that cannot be identified from are refused on their way in, with what and where.
+
+Refused: samples that are not finite, a channel that is constant (a cable that is not plugged in),
+a drive that is silent in a forced run. Clipping and noise are not refused: they are flags of
+quality, judged where the record is used.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from daq.errors import InputError
+from daq.records import Kind
+from drivers.types import Channel
+
+
+@dataclass
+class SampleCheck:
+    """Watches the samples of one recording go by, slice by slice.
+
+    Call `see` with slices of shape (frames, channels) in order, then `conclude`.
+    """
+
+    where: str
+    kind: Kind
+    channels: Sequence[Channel]
+    sample_rate_hz: float
+    frames: int = 0
+    low: npt.NDArray[Any] | None = None
+    high: npt.NDArray[Any] | None = None
+
+    def see(self, samples: npt.NDArray[Any]) -> None:
+        """Raises `InputError` for the first sample that is not a finite number."""
+        if samples.dtype.kind == "f" and not np.isfinite(samples).all():
+            row, column = np.argwhere(~np.isfinite(samples))[0]
+            frame = self.frames + int(row)
+            raise InputError(
+                f"{self.where}: channel {self.channels[column].name!r} is "
+                f"{samples[row, column]} at sample {frame} ({frame / self.sample_rate_hz:.4f} s)"
+            )
+        low, high = samples.min(axis=0), samples.max(axis=0)
+        self.low = low if self.low is None else np.minimum(low, self.low)
+        self.high = high if self.high is None else np.maximum(high, self.high)
+        self.frames += len(samples)
+
+    def conclude(self) -> None:
+        """Raises `InputError` for a constant channel and for a silent drive in a forced run."""
+        if self.low is None or self.high is None:
+            raise InputError(f"{self.where}: holds no samples")
+        for channel, low, high in zip(self.channels, self.low, self.high, strict=True):
+            if low != high:
+                continue
+            if channel.name != "drive":
+                raise InputError(
+                    f"{self.where}: channel {channel.name!r} is constant at {low:g} over all "
+                    f"{self.frames} samples; is it connected?"
+                )
+            if self.kind == "forced":
+                raise InputError(
+                    f"{self.where}: a forced run whose drive channel is constant at {low:g}: "
+                    "record the drive, or declare the run free"
+                )

@@ -1,0 +1,90 @@
+"""Single recordings described by options become a campaign: no `campaign.toml` needed.
+
+For files from elsewhere (a spectrum analyser's CSV, a colleague's MATLAB file): channels are
+picked by column number or by name, and each file is one run.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from daq.errors import InputError
+from daq.importers.folder import encoding, require_match, write_recording
+from daq.importers.recording import Recording, read_recording
+from daq.records import CampaignCard, Kind, RunHeader
+from daq.store import RunStore, slug, utc_now
+from drivers.types import Channel
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """How to understand a recording.
+
+    `channels` are in the order of `columns` (numbers from 0, or names of columns or variables;
+    empty: all columns). `sample_rate_hz` may stay None where the file says it.
+    """
+
+    channels: tuple[Channel, ...]
+    columns: tuple[int | str, ...] = ()
+    sample_rate_hz: float | None = None
+    kind: Kind = "free"
+    frequency_hz: float | None = None
+    amplitude_v: float | None = None
+    medium: dict[str, float] = field(default_factory=dict)
+
+
+def import_recordings(
+    files: Sequence[Path], options: RecordingOptions, store: RunStore, title: str = ""
+) -> CampaignCard:
+    """Bring files into the store as the runs of one new campaign, all understood alike.
+
+    Raises
+    ------
+    InputError
+        Naming the file and what is wrong with it or with the options.
+    """
+    if not files:
+        raise InputError("files=[] is not a list of one or more recordings")
+    read = [(path, select(path, options)) for path in files]
+    card = store.create_campaign(
+        title or read[0][0].stem,
+        medium=options.medium,
+        source=str(read[0][0].resolve().parent),
+        status="importing",
+    )
+    for index, (path, recording) in enumerate(read):
+        rate = options.sample_rate_hz or recording.sample_rate_hz
+        if rate is None:
+            raise InputError(f"{path}: the file does not tell its sample rate: give sample_rate_hz")
+        require_match(path, recording, len(options.channels), rate)
+        header = RunHeader(
+            name=f"{index:03d}-{slug(path.stem)}",
+            kind=options.kind,
+            sample_rate_hz=rate,
+            channels=options.channels,
+            **encoding(recording, [channel.full_scale_v for channel in options.channels]),
+            frequency_hz=options.frequency_hz,
+            amplitude_v=options.amplitude_v,
+            started_at=utc_now(),
+            notes={"imported_from": str(path)},
+        )
+        store.add_run(write_recording(store, card.id, header, recording, str(path)))
+    store.set_status(card.id, status="complete")
+    return store.card(card.id)
+
+
+def select(path: Path, options: RecordingOptions) -> Recording:
+    """Read a recording and pick the columns that `options` name."""
+    names = [column for column in options.columns if isinstance(column, str)]
+    numbers = [column for column in options.columns if isinstance(column, int)]
+    if names and numbers:
+        raise InputError(f"columns={options.columns} mix numbers and names")
+    recording = read_recording(path, names)
+    if not numbers:
+        return recording
+    width = recording.samples.shape[1]
+    outside = [number for number in numbers if not 0 <= number < width]
+    if outside:
+        raise InputError(f"{path}: column {outside[0]} is not one of its {width} (from 0)")
+    labels = tuple(recording.names[n] for n in numbers) if recording.names else ()
+    return replace(recording, samples=recording.samples[:, numbers], names=labels)

@@ -1,0 +1,350 @@
+"""`entrain identify`, `diagnose`: in this process, with a progress bar."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+from daq.errors import InputError
+from daq.service.commands import broadband
+from daq.service.commands.common import (
+    HtmlOption,
+    JsonOption,
+    StoreOption,
+    number,
+    open_store,
+    out,
+    table,
+    write_json,
+)
+
+if TYPE_CHECKING:
+    from identify.record import Campaign
+    from identify.results import Diagnosis, Identification
+
+CampaignArgument = Annotated[str, typer.Argument(help="Campaign folder, or campaign id.")]
+Tell = Callable[[float, str], None]
+
+
+@contextmanager
+def progress_bar(quiet: bool) -> Iterator[Tell]:
+    """A bar that `tell(fraction, text)` moves; drawn on standard error's terminal only."""
+    from daq.service.commands.common import err
+
+    bar = Progress(
+        TextColumn("{task.description:<44.44}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        console=err,
+        transient=True,
+        disable=quiet or not err.is_terminal,
+    )
+    with bar:
+        task = bar.add_task("starting", total=1.0)
+
+        def tell(fraction: float, text: str) -> None:
+            bar.update(task, completed=fraction, description=text)
+
+        yield tell
+
+
+ProcessesOption = Annotated[
+    int, typer.Option("--processes", min=0, help="Worker processes for the search; 0: one a core.")
+]
+
+
+PointOption = Annotated[
+    str | None,
+    typer.Option("--operating-point", help="Of a campaign that walked several: which (by name)."),
+]
+
+
+def load(
+    campaign: str, store: Path | None, point: str | None = None
+) -> "tuple[Campaign, list[dict[str, Any]]]":
+    """The campaign's recordings (at one operating point, where asked for), and the controller's
+    steps where it was recorded here."""
+    recorded, steps = _load(campaign, store)
+    if point is None:
+        return recorded, steps
+    try:
+        return recorded.at_operating_point(point), steps
+    except ValueError as error:
+        raise InputError(f"--operating-point: {error}") from error
+
+
+def _load(campaign: str, store: Path | None) -> "tuple[Campaign, list[dict[str, Any]]]":
+    from daq.importers import open_campaign
+    from daq.service.analysis_work import steps_in
+    from identify.load import load_campaign
+
+    # A folder is analysed as it lies there: it does not enter the store by being looked at.
+    if Path(campaign).is_dir():
+        folder = open_campaign(campaign)
+        return load_campaign(folder), steps_in(folder)
+    with open_store(store) as source:
+        folder = open_campaign(campaign, source)
+        return load_campaign(folder), steps_in(folder)
+
+
+def identify(
+    campaign: CampaignArgument,
+    json_: JsonOption = None,
+    html: HtmlOption = None,
+    store: StoreOption = None,
+    model: Annotated[
+        Path | None, typer.Option(help="Model declared in TOML, instead of the campaign's own.")
+    ] = None,
+    operating_point: PointOption = None,
+) -> None:
+    """Fit the declared model to a campaign."""
+    from identify.declare import described, read_model
+    from identify.identification import identify as run
+
+    structure = None if model is None else read_model(model)
+    recorded, steps = load(campaign, store, operating_point)
+    if structure is not None:
+        recorded = replace(recorded, declared_model=described(structure))
+    quiet = str(json_) == "-"
+    with progress_bar(quiet) as tell:
+        found = run(recorded, structure=structure, progress=tell)
+    write_json(json_, found.to_json())
+    if html is not None:
+        from identify.report import write_html
+
+        write_html(html, found, recorded, steps)
+    if not quiet:
+        show_identification(found)
+        show_calibration(recorded)
+    if not found.assessment.fit.converged:
+        raise typer.Exit(1)
+
+
+def diagnose(
+    campaign: CampaignArgument,
+    json_: JsonOption = None,
+    html: HtmlOption = None,
+    store: StoreOption = None,
+    processes: ProcessesOption = 0,
+    operating_point: PointOption = None,
+) -> None:
+    """Trace what the declared model lacks: verdict, effect, error before and after."""
+    from daq.importers.broadband import is_broadband
+
+    if is_broadband(campaign):
+        if html is not None:
+            raise InputError(
+                f"--html {html}: a campaign with broadband excitation has no HTML report; "
+                "leave it out, --json holds everything"
+            )
+        broadband.diagnose(campaign, json_)
+        return
+    from identify.diagnosis import diagnose as run
+    from identify.executor import executor
+
+    recorded, steps = load(campaign, store, operating_point)
+    quiet = str(json_) == "-"
+    with executor(processes) as workers, progress_bar(quiet) as tell:
+        found = run(recorded, progress=tell, executor=workers)
+    if not Path(campaign).is_dir():
+        with open_store(store) as target:
+            target.set_status(campaign, verdict=found.verdict)
+    write_json(json_, found.to_json())
+    if html is not None:
+        from identify.report import write_html
+
+        write_html(html, found, recorded, steps)
+    if not quiet:
+        show_diagnosis(found)
+        show_calibration(recorded)
+
+
+def show_calibration(recorded: "Campaign") -> None:
+    """Print what is missing or stale of the channels' calibration."""
+    for text in recorded.calibration_remarks:
+        out.print(f"calibration: {text}", markup=False)
+
+
+def show_identification(found: "Identification") -> None:
+    """Print an identification."""
+    a = found.assessment
+    if not a.fit.converged:
+        out.print(f"the fit did not converge: {a.fit.reason}", markup=False)
+        return
+    show_parameters("parameters", found.to_json()["parameters"])
+    table(
+        "",
+        ("fit error", "validation error", "noise floor", "χ²/dof", "dof", "seconds"),
+        [
+            (
+                number(a.fit_error, 3),
+                number(a.validation_error, 3),
+                number(a.noise_floor, 3),
+                number(a.chi2_per_dof),
+                a.dof,
+                number(found.seconds, 3),
+            )
+        ],
+    )
+    rows = [("measured", a.measured_cycle), ("the model's own", a.model_cycle)]
+    table(
+        "free limit cycle",
+        ("", "frequency (Hz)", "amplitude (m/s)", "harmonics over the fundamental", ""),
+        (
+            (
+                name,
+                number(c.frequency_hz, 7),
+                number(c.amplitude, 5),
+                "  ".join(number(v, 3) for v in c.harmonics),
+                {True: "stable", False: "unstable", None: ""}[c.stable],
+            )
+            for name, c in rows
+            if c is not None
+        ),
+    )
+    show_validation(found)
+    show_quality(found)
+
+
+def show_validation(found: "Identification") -> None:
+    """Print what the model says of what it was not fitted to, and how sure its parameters are."""
+    from identify.report import sections
+
+    a = found.assessment
+    if rows := sections.lock_in_rows(a):
+        table("the model's own lock-in boundary", sections.LOCK_IN_HEAD, rows)
+    if rows := sections.prediction_rows(a):
+        table("predictions", sections.PREDICTION_HEAD, rows)
+    if rows := sections.residual_test_rows(a):
+        table("what the fit leaves", sections.RESIDUAL_TEST_HEAD, rows)
+    notes = sections.interval_notes(found)
+    notes += [f"not determined by these data: {text}" for text in found.undetermined]
+    for note in notes:
+        out.print(note, markup=False)
+
+
+def show_parameters(title: str, parameters: dict[str, dict[str, Any]]) -> None:
+    """Print values with standard errors."""
+    table(
+        title,
+        ("parameter", "value", "standard error", "unit"),
+        (
+            (name, number(p["value"], 6), number(p["stderr"], 2), p["unit"])
+            for name, p in parameters.items()
+        ),
+    )
+
+
+def show_diagnosis(found: "Diagnosis") -> None:
+    """Print errors before and after, the candidates, the verdict."""
+    before, after = found.before, found.after
+    table(
+        "error before and after",
+        ("", "before", "after"),
+        (
+            (
+                "validation error",
+                number(before.validation_error, 3),
+                number(after.validation_error, 3),
+            ),
+            ("fit error", number(before.fit_error, 3), number(after.fit_error, 3)),
+            ("χ² per degree of freedom", number(before.chi2_per_dof), number(after.chi2_per_dof)),
+            ("noise floor", number(found.noise_floor, 3), number(found.noise_floor, 3)),
+        ),
+    )
+    if found.candidates:
+        table(
+            "candidates, best first",
+            ("effects", "where", "χ²/dof", "validation error", "p"),
+            (
+                (
+                    " + ".join(c.effects),
+                    ", ".join(c.locations),
+                    number(c.chi2_per_dof),
+                    number(c.validation_error, 3),
+                    number(c.p_value, 2),
+                )
+                for c in found.candidates[:8]
+            ),
+        )
+    show_quality(found)
+    out.print(f"[bold]verdict: {found.verdict}[/bold]   ({found.seconds:.1f} s)")
+    for effect in found.effects:
+        row = effect.to_json()
+        show_parameters(f"{row['effect']} ({row['location']})", row["parameters"])
+    if found.explanation:
+        out.print(found.explanation, markup=False)
+    if found.next_experiment:
+        out.print(f"next experiment: {found.next_experiment['reason']}", markup=False)
+        out.print("run it: --json FILE, then `entrain campaign run FILE`", markup=False)
+
+
+def show_quality(found: "Identification | Diagnosis") -> None:
+    """Print what is wrong with recordings, if anything is."""
+    if found.quality:
+        table(
+            "data quality",
+            ("run", "flag", "detail", "consequence"),
+            ((q.run, q.flag, q.detail, q.severity) for q in found.quality),
+        )
+
+
+def characterise(
+    file: Annotated[
+        Path, typer.Argument(help="A recording of an oscillation that nothing forces.")
+    ],
+    signal: Annotated[
+        str | None, typer.Option(help="Channel to characterise; else the pressure.")
+    ] = None,
+    name: Annotated[
+        list[str] | None, typer.Option(help="Name of each signal column, in order.")
+    ] = None,
+    rate_hz: Annotated[
+        float | None, typer.Option(help="Sample rate where the file has none.")
+    ] = None,
+    json_: JsonOption = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Also write a figure (.png, .svg, .pdf).")
+    ] = None,
+) -> None:
+    """Regime, frequency, amplitude, harmonics, growth rate of an unforced oscillation."""
+    from daq.errors import InputError
+    from daq.service.words import read_unforced
+    from identify.characterise import characterise_recording
+    from identify.characterise import figure as draw
+
+    recording = read_unforced(file, name or [], rate_hz)
+    try:
+        found = characterise_recording(recording, signal)
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from error
+    write_json(json_, found.to_json())
+    if figure is not None:
+        names = list(recording.signals)
+        chosen = signal or next((n for n in names if n.lower().startswith("p")), names[-1])
+        draw(found, recording.signals[chosen], figure, title=file.name)
+    if str(json_) != "-":
+        show_characterisation(found.to_json())
+
+
+def show_characterisation(found: dict[str, Any]) -> None:
+    """Print a characterisation."""
+
+    def pair(value: dict[str, Any] | None, unit: str) -> str:
+        if value is None:
+            return "–"
+        return f"{number(value['value'], 6)} ± {number(value['stderr'], 2)} {unit}"
+
+    rows = [
+        ("regime", found["regime"]),
+        ("frequency", pair(found["frequency_hz"], "Hz")),
+        ("amplitude", pair(found["amplitude"], found["amplitude"]["unit"])),
+        ("harmonics (dB)", "  ".join(f"{level:.1f}" for level in found["harmonics_db"])),
+        ("growth rate", pair(found["growth_rate_per_s"], "1/s")),
+        *((f"phase of {k}", pair(v, "°")) for k, v in found["phase_deg"].items()),
+    ]
+    table("", ("", ""), rows)

@@ -1,0 +1,61 @@
+"""`entrain diagnose` of a campaign with broadband excitation."""
+
+from pathlib import Path
+
+from daq.service.commands.common import number, out, table, write_json
+
+
+def diagnose(folder: str, json_: Path | None) -> None:
+    """Add effects to the declared oscillator as long as the residual asks for them; print each."""
+    from daq.importers.broadband import read_broadband
+    from identify.broadband import Lines, diagnose_broadband
+
+    record = read_broadband(folder)
+    lines = None
+    if record.period_samples is not None and record.period_starts:
+        lines = Lines(record.period_starts, record.period_samples)
+    found = diagnose_broadband(
+        record.drive,
+        record.response,
+        record.sample_rate_hz,
+        declared=record.feedback,
+        estimation=record.estimation,
+        test=record.test,
+        lines=lines,
+        noise=record.noise,
+        title=record.title,
+    )
+    write_json(json_, found.to_json())
+    if str(json_) == "-":
+        return
+    kept = [name for name in ("odd_excited", "even") if name in found.stages[0].lines_rms]
+    table(
+        f"simulation error, RMS ({found.unit})",
+        ("model", "parameters", "estimation", "test", *(f"{n.split('_')[0]} lines" for n in kept)),
+        [
+            (
+                found.declared if s.added is None else f"+ {s.added.candidate.kind}",
+                s.fit.theta.size,
+                number(s.fit_rms, 4),
+                number(s.test_rms, 4),
+                *(number(s.lines_rms[name], 3) for name in kept),
+            )
+            for s in found.stages
+        ],
+    )
+    table(
+        "what was added",
+        ("effect", "location", "kind"),
+        [
+            (s.added.candidate.effect, s.added.candidate.location, s.added.candidate.kind)
+            for s in found.stages
+            if s.added is not None
+        ],
+    )
+    rest = found.remainder
+    noise = "unknown" if rest.noise_rms is None else f"{number(rest.noise_rms, 3)} {found.unit}"
+    out.print(
+        f"verdict {found.verdict}: {number(rest.rms, 3)} {found.unit} are left, noise is {noise} "
+        f"({found.seconds:.0f} s)",
+        markup=False,
+    )

@@ -1,0 +1,85 @@
+"""What the commands share: the console, the store in force, tables, JSON files, errors' exits."""
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from daq.store import RunStore
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+StoreOption = Annotated[
+    Path | None, typer.Option("--store", help="Run store; else the configured one.")
+]
+JsonOption = Annotated[
+    Path | None, typer.Option("--json", help="Also write the result as JSON; - for stdout.")
+]
+HtmlOption = Annotated[
+    Path | None, typer.Option("--html", help="Also write a self-contained HTML report.")
+]
+
+
+_config: ContextVar[Path | None] = ContextVar("config", default=None)
+
+
+def use_config(path: Path | None) -> None:
+    """Remember the ``--config`` of this call."""
+    _config.set(path)
+
+
+def config_file() -> Path | None:
+    """The ``--config`` of this call."""
+    return _config.get()
+
+
+@contextmanager
+def open_store(place: Path | None) -> Iterator["RunStore"]:
+    """The store at `place`, or the configured one."""
+    from daq.store import RunStore
+
+    if place is None:
+        from daq.service.settings import load
+
+        place = load(config_file()).store_dir
+    store = RunStore(place)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Print a table; every cell is text, never markup."""
+    shown = Table(title=title or None, title_justify="left")
+    for index, column in enumerate(columns):
+        shown.add_column(column, no_wrap=index == 0, overflow="fold")
+    for row in rows:
+        shown.add_row(*(escape("" if cell is None else str(cell)) for cell in row))
+    out.print(shown)
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number as tables show it."""
+    return "–" if value is None else f"{value:.{digits}g}"
+
+
+def write_json(place: Path | None, content: dict[str, Any]) -> None:
+    """Write `content` to `place`, or to stdout for ``-``; nothing for None."""
+    if place is None:
+        return
+    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    if str(place) == "-":
+        sys.stdout.write(text + "\n")
+    else:
+        place.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,155 @@
+"""`entrain close-loop`: campaign, diagnosis, next experiment, and again, in this terminal."""
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from daq.service.commands.analysis import progress_bar, show_diagnosis
+from daq.service.commands.common import (
+    HtmlOption,
+    JsonOption,
+    StoreOption,
+    number,
+    open_store,
+    out,
+    table,
+    write_json,
+)
+from daq.service.commands.demo import show_truth
+from daq.service.commands.rig import (
+    CampaignView,
+    PlanArgument,
+    RigOption,
+    SeedOption,
+    choose_rig,
+    interruptible,
+    read,
+)
+
+if TYPE_CHECKING:
+    from daq.closeloop import Closed, Recorded, Round
+    from daq.plan import Plan
+    from daq.service.loop_work import RigSteps
+
+ENDINGS = {
+    "traced": "what the model lacked is found",
+    "adequate": "the declared model explains the data to within noise",
+    "no_proposal": "nothing that the rig can do would tell more",
+    "out_of_budget": "the budget is spent",
+    "stopped": "stopped; `entrain close-loop --resume {name}` goes on",
+}
+
+
+class Shown:
+    """Steps that show what they do: a bar a campaign, a bar a diagnosis."""
+
+    def __init__(self, steps: "RigSteps", quiet: bool) -> None:
+        self._steps = steps
+        self._quiet = quiet
+
+    def expected_seconds(self, plan: "Plan") -> float:
+        return self._steps.expected_seconds(plan)
+
+    def record(self, campaign: str, plan: "Plan") -> "Recorded":
+        with CampaignView(plan, self._quiet) as view:
+            self._steps.on_event = view.tell
+            return self._steps.record(campaign, plan)
+
+    def diagnose(self, campaign: str) -> dict[str, Any] | None:
+        with progress_bar(self._quiet) as tell:
+            self._steps.progress = tell
+            return self._steps.diagnose(campaign)
+
+
+def close_loop(
+    plan: PlanArgument = None,
+    rig: RigOption = None,
+    seed: SeedOption = None,
+    sealed: Annotated[
+        bool,
+        typer.Option(
+            "--sealed", help="A simulated rig carries what --seed draws, told at the end."
+        ),
+    ] = False,
+    rounds: Annotated[int, typer.Option(min=1, max=50, help="At most so many campaigns.")] = 4,
+    minutes: Annotated[float, typer.Option(min=0.0, help="At most so much rig time.")] = 60.0,
+    resume: Annotated[
+        str | None, typer.Option(help="Go on with the loop that began with this campaign.")
+    ] = None,
+    store: StoreOption = None,
+    json_: JsonOption = None,
+    html: HtmlOption = None,
+) -> None:
+    """Measure, diagnose, measure what tells most next, until the verdict stands. Ctrl-C ends."""
+    from daq.campaign import StopRequested
+    from daq.closeloop import Budget
+    from daq.errors import InputError
+    from daq.service import loop_work
+    from daq.service.campaign_names import begun_with, new_name
+    from daq.service.rig_facts import truth
+    from daq.service.rigs import SIMULATED, open_rig
+
+    quiet = str(json_) == "-"
+
+    def tell(done: "Round") -> None:
+        if not quiet:
+            out.print(loop_work.sentence(done), markup=False)
+
+    stop: list[int] = []
+
+    def heed() -> None:
+        if stop:
+            raise StopRequested("interrupted at the keyboard")
+
+    with open_store(store) as target:
+        first = read(plan) if resume is None else begun_with(target, resume)
+        entry = choose_rig(rig or (target.card(resume).rig if resume else None), seed)
+        if sealed:
+            if entry.driver != SIMULATED:
+                raise InputError(f"--sealed: rig {entry.name!r} is not a simulated one")
+            entry = replace(entry, options={**entry.options, "effects": "sealed"})
+        with open_rig(entry) as device, interruptible(stop):
+            steps = loop_work.RigSteps(device, target, heed)
+            name = resume or new_name(first.title)
+            closed = loop_work.turn(
+                name, first, Shown(steps, quiet), target, Budget(rounds, minutes), tell
+            )
+        if html is not None:
+            loop_work.write_report(html, steps.last, target)
+    write_json(json_, closed.to_json())
+    if not quiet:
+        if steps.last is not None:
+            show_diagnosis(steps.last)
+        show_rounds(closed)
+        if sealed:
+            show_truth(truth(entry.options))
+    if closed.ending not in ("traced", "adequate"):
+        raise typer.Exit(1)
+
+
+def show_rounds(closed: "Closed") -> None:
+    """Print what each round came to, and how the loop ended."""
+    table(
+        f"closed loop {closed.name}",
+        ("#", "verdict", "found, or rivals", "χ²/dof", "validation error", "runs", "rig min"),
+        (
+            (
+                r.number,
+                r.verdict,
+                " + ".join(r.effects) if r.verdict == "traced" else " or ".join(r.rivals),
+                f"{number(r.before.chi2_per_dof, 3)} → {number(r.after.chi2_per_dof, 3)}",
+                f"{number(r.before.validation_error, 3)} → {number(r.after.validation_error, 3)}"
+                f" (floor {number(r.noise_floor, 2)})",
+                r.runs,
+                f"{r.rig_seconds / 60:.1f}",
+            )
+            for r in closed.rounds
+        ),
+    )
+    meaning = ENDINGS[closed.ending].format(name=closed.name)
+    out.print(
+        f"{closed.ending}: {meaning}; {closed.rig_seconds / 60:.1f} min of rig time in all. "
+        f"{closed.reason}",
+        markup=False,
+    )

@@ -1,0 +1,27 @@
+"""`entrain reproduce`: the thesis made again, on one page."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from daq.service.commands.analysis import progress_bar
+from daq.service.commands.common import out
+
+
+def reproduce(
+    folder: Annotated[Path, typer.Option("--out", help="Where reproduction.html goes.")] = Path(
+        "entrain-reproduction"
+    ),
+) -> None:
+    """Make the thesis's tables and figures again, theirs beside ours, on one page.
+
+    Some two minutes of computing, most of them for tracing what the re-enacted experiment lacks.
+    """
+    from daq.service.reproduce import reproduce as make
+
+    started = time.monotonic()
+    with progress_bar(quiet=False) as tell:
+        path = make(folder, tell)
+    out.print(f"wrote {path} ({time.monotonic() - started:.0f} s)", markup=False, soft_wrap=True)

@@ -1,0 +1,19 @@
+"""What a plan comes to, asked in a process aside: the service itself loads no identification."""
+
+from pathlib import Path
+from typing import Any
+
+from daq.plan import Plan, parse_plan
+from daq.store import RunStore
+
+
+def planned(plan: dict[str, Any], store: str) -> tuple[Plan, list[dict[str, Any]]]:
+    """A plan with its design's conditions, and the precision that is expected of it."""
+    from daq.service.designing import expected_precision, resolved
+
+    target = RunStore(Path(store))
+    try:
+        found = resolved(parse_plan(plan), target)
+        return found, expected_precision(found, target)
+    finally:
+        target.close()

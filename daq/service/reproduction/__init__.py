@@ -1,0 +1,1 @@
+"""The thesis's tables and figures made again, one module a chapter's part."""

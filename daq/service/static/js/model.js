@@ -1,0 +1,76 @@
+// What is known of each rig, built from the live stream: survives changing views, rebuilt on reload.
+import { get } from "./api.js";
+import * as stream from "./stream.js";
+
+const rigs = new Map();   // name -> {job, campaign, free, conditions: Map, window, log: [], levels, spectrum, waveform}
+const jobs = new Map();
+const watchers = new Set();
+let queued = false;
+
+export function of(name) {
+  if (!rigs.has(name)) rigs.set(name, fresh());
+  return rigs.get(name);
+}
+function fresh() { return { job: null, campaign: null, free: null, conditions: new Map(), window: null, current: null, log: [], outcome: null }; }
+
+export const job = (id) => jobs.get(id);
+export const anyRunning = () => [...jobs.values()].some((one) => one.state === "running" && one.about.rig);
+export function watch(listener) { watchers.add(listener); return () => watchers.delete(listener); }
+function changed() {
+  if (queued) return;
+  queued = true;
+  requestAnimationFrame(() => { queued = false; for (const listener of watchers) listener(); });
+}
+
+function forRig(event) {
+  const name = event.data?.rig ?? event.rig;
+  return name ? of(name) : null;
+}
+
+export function start() {
+  stream.on("resumed", async () => {
+    try { for (const one of (await get("/jobs", { limit: 100 })).items) if (!jobs.has(one.id)) jobs.set(one.id, one); } catch { /* the next job event brings them */ }
+    changed();
+  });
+  stream.on("job", ({ data }) => {
+    jobs.set(data.id, data);
+    if (data.about.rig && data.kind !== "watch" && data.state === "running") {
+      const rig = of(data.about.rig);
+      if (rig.job !== data.id) rigs.set(data.about.rig, { ...fresh(), job: data.id, campaign: data.about.campaign, levels: rig.levels });
+    }
+    changed();
+  });
+  stream.on("progress", ({ data }) => {
+    const one = jobs.get(data.job);
+    if (one) Object.assign(one, { progress: data.progress, message: data.message });
+    changed();
+  });
+  stream.on("log", ({ data, time }) => {
+    const rig = data.rig ? of(data.rig) : null;
+    if (rig) { rig.log.push(`${time.slice(11, 19)} ${data.text}`); if (rig.log.length > 400) rig.log.shift(); changed(); }
+  });
+  stream.on("campaign", (event) => {
+    const rig = forRig(event), { kind, index, data } = event.data;
+    if (!rig) return;
+    if (kind === "free") rig.free = data;
+    if (kind === "condition") { rig.current = { index, ...data }; rig.conditions.set(index, { ...data, state: "approaching" }); }
+    if (kind === "window") {
+      rig.window = data;
+      const known = rig.conditions.get(index) || {};
+      rig.conditions.set(index, { ...known, frequency_hz: data.frequency_hz, drive_v: data.drive_v, threshold_v: data.threshold_v ?? known.threshold_v, state: "approaching" });
+    }
+    if (kind === "recorded" || kind === "not_entrained" || kind === "skipped") {
+      const known = rig.conditions.get(index) || {};
+      rig.conditions.set(index, { ...known, ...data, drive_v: data.amplitude_v ?? known.drive_v, state: kind === "recorded" ? data.status : kind });
+    }
+    if (kind === "finished" || kind === "failed") { rig.outcome = { kind, ...data }; rig.window = null; rig.current = null; }
+    changed();
+  });
+  for (const kind of ["levels", "waveform", "spectrum"]) {
+    stream.on(kind, (event) => {
+      const rig = forRig(event);
+      if (rig) { rig[kind] = kind === "levels" ? event.data : event; changed(); }
+    });
+  }
+  for (const kind of ["control", "emergency_stop", "reset"]) stream.on(kind, changed);
+}

@@ -1,0 +1,54 @@
+// Diagnosis: verdict, error before and after, residual by harmonic and condition, candidates, next experiment.
+import { attempt, get, post } from "../api.js";
+import { card, h, num, table } from "../dom.js";
+import { curveCards, parameterTable, plusMinus, reportLinks } from "./identification.js";
+
+const WORDS = {
+  no_discrepancy: ["good", "No discrepancy: the declared model explains the data to within noise."],
+  traced: ["good", "Traced: what the model lacked is found."],
+  ambiguous: ["warn", "Ambiguous: several causes explain the data alike."],
+  unexplained: ["bad", "Unexplained: nothing known explains the rest."],
+};
+
+// one cell for a harmonic of a run: how many standard errors measured and modelled differ
+function heat(caption, rows) {
+  const harmonics = Math.max(0, ...rows.map((row) => row.in_stderr.length));
+  const shade = (v) => {
+    if (v === null || v === undefined) return "";
+    const share = Math.min(1, Math.log10(1 + Math.max(0, v - 1)) / 2.2);
+    return `background: color-mix(in srgb, var(--bad) ${(70 * share).toFixed(0)}%, transparent)`;
+  };
+  return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": caption }, h("table", { class: "heat" }, h("caption", {}, caption),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "run"), h("th", { scope: "col" }, "role"), Array.from({ length: harmonics }, (_, k) => h("th", { scope: "col", "aria-label": `harmonic ${k + 1}` }, String(k + 1))))),
+    h("tbody", {}, rows.map((row) => h("tr", {}, h("th", { scope: "row" }, row.run), h("td", {}, row.role), Array.from({ length: harmonics }, (_, k) => h("td", { style: shade(row.in_stderr[k]) }, num(row.in_stderr[k], 2))))))));
+}
+
+export async function drawDiagnosis(job) {
+  const [d, detail] = await Promise.all([get(`/diagnoses/${job.id}`), get(`/diagnoses/${job.id}/details`)]);
+  const [tone, words] = WORDS[d.verdict];
+  const pair = (name, key, digits = 3) => [name, num(d.before[key], digits), num(d.after[key], digits)];
+  const next = d.next_experiment;
+  const run = async () => {
+    const rigs = await attempt(() => get("/rigs"));
+    if (!rigs) return;
+    const rig = job.about.rig || rigs[0]?.name;
+    const made = await attempt(() => post(`/diagnoses/${job.id}/next-experiment`, { rig }, rig), "next experiment queued");
+    if (made) location.hash = `live/${made.about.rig}`;
+  };
+  return h("div", { class: "grid" },
+    card("w5", "Verdict", h("p", { class: `verdict ${tone}`, id: "verdict", "data-verdict": d.verdict }, words),
+      d.effects.map((e) => h("div", {}, h("h3", {}, `${e.effect} (${e.location})`), h("dl", {}, Object.entries(e.parameters).flatMap(([name, p]) => [h("dt", {}, name), h("dd", {}, `${plusMinus(p)} ${p.unit}`)])))),
+      d.explanation ? h("p", {}, d.explanation) : "", reportLinks({ "HTML report": `/diagnoses/${job.id}/report`, JSON: `/diagnoses/${job.id}` })),
+    card("w7", "Error before and after", table("", ["", "before", "after"], [pair("validation error", "validation_error"), pair("fit error", "fit_error"), pair("χ² per degree of freedom", "chi2_per_dof", 4), ["noise floor", num(d.noise_floor, 3), num(d.noise_floor, 3)]], { numeric: [1, 2] }),
+      h("p", { class: "soft" }, `Residual before: ${d.residual.significant ? "significant" : "within noise"}, p ${d.residual.p_value === 0 ? "< 1e-300" : `= ${num(d.residual.p_value, 3)}`}. ${num(d.seconds, 3)} s.`)),
+    card("w6", "Residual before", heat("Measured less modelled by harmonic, in standard errors", detail.before)),
+    card("w6", "Residual after", heat("Measured less modelled by harmonic, in standard errors", detail.after)),
+    card("", "Candidates, best first", table("", ["effects", "where", "χ²/dof", "validation error", "p", "parameters", "remarks"], d.candidates.map((c) => [
+      c.effects.join(" + "), c.locations.join(", "), num(c.chi2_per_dof, 4), num(c.validation_error, 3), num(c.p_value, 2), Object.entries(c.parameters).map(([k, p]) => `${k} = ${plusMinus(p)} ${p.unit}`).join("; "),
+      [c.plausible ? "" : "implausible", c.equivalent_to.length ? `not told apart from ${c.equivalent_to.join(", ")}` : "", c.note || ""].filter(Boolean).join("; ")]), { numeric: [2, 3, 4], empty: "none was needed" })),
+    card("", "Next experiment", next ? [h("p", {}, next.reason || next.why || "What to measure to tell the rivals apart:"), h("pre", { class: "scroll", tabindex: "0" }, JSON.stringify(next, null, 1)), h("button", { type: "button", class: "primary", onclick: run }, "Run it")] : h("p", {}, "None is needed.")),
+    card("w6", "Parameters before", parameterTable("", d.before.parameters)),
+    card("w6", "Parameters after", parameterTable("", d.after.parameters)),
+    curveCards(detail.curves),
+    d.quality.length ? card("", "Data quality", table("", ["run", "flag", "detail", "severity"], d.quality.map((q) => [q.run, q.flag, q.detail, q.severity]))) : "");
+}

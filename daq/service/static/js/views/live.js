@@ -1,0 +1,171 @@
+// Live: what the rig does now, against its limits; steering; the tongue as it fills up.
+import { attempt, controlToken, get, keepToken, post, api } from "../api.js";
+import { card, h, num } from "../dom.js";
+import * as model from "../model.js";
+import { Curves, Portrait, scatter } from "../plot.js";
+
+const CRITERION_DB = -20;
+const COLOURS = ["--c1", "--c2", "--c3", "--c4"];
+
+export default async function live([wanted]) {
+  const list = await get("/rigs");
+  const running = list.find((rig) => rig.state === "running");
+  const name = wanted || running?.name || list[0]?.name;
+  if (!name) return { title: "Live", content: h("p", {}, "No rig is configured. Add a simulated one under Rigs.") };
+
+  const picker = h("select", { "aria-label": "Rig", onchange: (e) => { location.hash = `live/${e.target.value}`; } },
+    list.map((rig) => h("option", { value: rig.name, selected: rig.name === name }, rig.name)));
+  const state = h("div", { class: "row", role: "status" });
+  const progress = h("progress", { max: "1", value: "0", "aria-label": "Campaign's progress" });
+  const message = h("p", { class: "soft" }, "");
+  const steer = (command) => attempt(() => post(`/jobs/${rigJob()}/${command}`, {}, name));
+  const rigJob = () => { const one = current(); return one?.id; };
+  const current = () => [...[model.of(name).job].map(model.job)].find((one) => one && (one.state === "running" || one.state === "queued"));
+  const buttons = {
+    pause: h("button", { type: "button", onclick: () => steer("pause") }, "Pause"),
+    resume: h("button", { type: "button", onclick: () => steer("resume") }, "Resume"),
+    skip: h("button", { type: "button", onclick: () => steer("skip") }, "Skip condition"),
+    stop: h("button", { type: "button", class: "danger", onclick: () => steer("stop") }, "End campaign"),
+  };
+  const watch = h("button", { type: "button", onclick: () => attempt(() => post(`/rigs/${name}/watch`, { seconds: 60 }, name), "watching for a minute") }, "Watch for a minute");
+  const control = h("button", { type: "button", onclick: toggleControl }, "Take control");
+  const reset = h("button", { type: "button", class: "primary", hidden: true, onclick: () => attempt(() => post(`/rigs/${name}/reset`, {}, name), "output is allowed again").then(refresh) }, "Reset stop");
+
+  async function toggleControl() {
+    if (controlToken(name)) {
+      await attempt(() => api("DELETE", `/rigs/${name}/lock`, { rig: name }), "control given back");
+      keepToken(name, null);
+    } else {
+      const takeover = Boolean(facts.holder);
+      if (takeover && !confirm(`${facts.holder} has control of ${name}. Take it over?`)) return;
+      const lock = await attempt(() => post(`/rigs/${name}/lock`, { takeover }, name), "you have control");
+      if (lock) keepToken(name, lock.token);
+    }
+    refresh();
+  }
+
+  const meters = h("div", {});
+  const gauge = h("div", { class: "meter", role: "meter", "aria-label": "Limit cycle below its free level, dB", "aria-valuemin": "-60", "aria-valuemax": "0" }, h("i"), h("b", { style: `left:${100 * (60 + CRITERION_DB) / 60}%` }));
+  const gaugeText = h("div", { class: "big" }, "–");
+  const gaugeNote = h("p", { class: "soft" }, "entrained when at least 20 dB below its free level");
+  const values = h("dl", {});
+  const wave = new Curves({ label: "Waveform of the pressure channels", x: "time (ms)", y: "Pa", series: [{ label: "p1", colour: "--c1" }, { label: "p2", colour: "--c2" }] });
+  const rig = () => model.of(name);
+  const spectrum = new Curves({
+    label: "Spectrum of the pressure channels with the limit cycle and forcing lines marked", x: "frequency (Hz)", y: "dB re 1 Pa", height: 260,
+    series: [{ label: "p1", colour: "--c1" }, { label: "p2", colour: "--c2" }],
+    marks: () => [
+      { x: rig().free?.frequency_hz, label: "limit cycle", colour: "--c3", row: 1 },
+      { x: rig().window?.frequency_hz ?? rig().current?.frequency_hz, label: "forcing", colour: "--c2", row: 2 }],
+  });
+  const portrait = new Portrait("Phase portrait: the first pressure channel against itself a quarter of a period earlier");
+  const tongue = h("div", {});
+  const tongueText = h("p", { class: "soft" }, "");
+  const log = h("div", { class: "log", role: "log", "aria-label": "Campaign's log", tabindex: "0" });
+  let facts = list.find((one) => one.name === name) || {}, logged = 0, tongueKey = "";
+
+  async function refresh() {
+    try { facts = await get(`/rigs/${name}`); } catch { return; }
+    draw();
+  }
+
+  function draw() {
+    const seen = rig(), job = current();
+    const mine = Boolean(controlToken(name));
+    state.replaceChildren(
+      h("span", { class: `chip ${facts.state === "stopped" ? "bad" : job?.state === "running" ? "good" : ""}` }, facts.state === "stopped" ? `stopped by ${facts.stopped_by}` : job ? job.state : "idle"),
+      h("span", { class: "chip" }, facts.holder ? `control: ${mine ? "you" : facts.holder}` : "control: free"),
+      facts.queued ? h("span", { class: "chip" }, `${facts.queued} waiting`) : "");
+    control.textContent = mine ? "Give control back" : "Take control";
+    reset.hidden = facts.state !== "stopped";
+    for (const button of Object.values(buttons)) button.disabled = !job;
+    watch.disabled = Boolean(job);
+    progress.value = job?.progress ?? (seen.outcome ? 1 : 0);
+    message.replaceChildren(job ? job.message || job.title : seen.outcome ? `campaign ${seen.outcome.status ?? seen.outcome.kind} ${seen.outcome.reason || ""}` : "no campaign is running", " ",
+      seen.campaign ? h("a", { href: `#campaign/${seen.campaign}` }, "open the campaign") : "");
+    drawLevels(seen.levels);
+    drawGauge(seen);
+    if (seen.waveform) drawWave(seen.waveform);
+    if (seen.spectrum) drawSpectrum(seen.spectrum);
+    drawTongue(seen);
+    if (logged !== seen.log.length) {
+      log.textContent = seen.log.slice(-200).join("\n");
+      log.scrollTop = log.scrollHeight;
+      logged = seen.log.length;
+    }
+  }
+
+  function drawLevels(levels) {
+    if (!levels) { meters.replaceChildren(h("p", { class: "soft" }, "No signal: start a campaign, or watch.")); return; }
+    const rows = levels.channels.map((one) => bar(one.name, one.of_full_scale, `${num(one.rms, 3)} ${one.unit} rms`));
+    rows.push(bar("output", levels.output_v / levels.limit_v, `${num(levels.output_v, 3)} of ${num(levels.limit_v, 3)} V`));
+    meters.replaceChildren(...rows,
+      h("p", { class: levels.lost_frames ? "bad" : "soft" }, `${levels.lost_frames} of ${levels.frames} frames lost${levels.muted ? `; muted: ${levels.muted}` : ""}${levels.fault ? `; ${levels.fault}` : ""}`));
+  }
+  function bar(label, share, text) {
+    const percent = Math.min(100, Math.max(0, 100 * share));
+    return h("div", { class: "level" }, h("div", { class: "row" }, h("span", {}, label), h("span", { class: "soft" }, text), h("span", { class: "spacer" }), h("span", { class: "soft" }, `${percent.toFixed(0)} %`)),
+      h("div", { class: `meter ${share > 0.95 ? "hot" : share > 0.8 ? "warm" : ""}`, role: "meter", "aria-label": `${label}, share of its limit`, "aria-valuemin": "0", "aria-valuemax": "100", "aria-valuenow": percent.toFixed(0) }, h("i", { style: `width:${percent}%` })));
+  }
+  function drawGauge(seen) {
+    const level = seen.window?.suppression_db;
+    const shown = level === undefined || level === null ? null : Math.max(-60, Math.min(0, level));
+    gauge.firstChild.style.width = shown === null ? "0" : `${100 * -shown / 60}%`;
+    gauge.lastChild.style.left = `${100 * -CRITERION_DB / 60}%`;
+    gauge.setAttribute("aria-valuenow", shown === null ? "0" : shown.toFixed(1));
+    gaugeText.textContent = level === undefined || level === null ? "–" : `${level.toFixed(1)} dB`;
+    gaugeText.className = `big ${level <= CRITERION_DB ? "good" : ""}`;
+    const pairs = [
+      ["free limit cycle", seen.free ? `${num(seen.free.frequency_hz, 6)} Hz, ${num(seen.free.amplitude)}` : "–"],
+      ["forcing", seen.window ? `${num(seen.window.frequency_hz, 6)} Hz at ${num(seen.window.drive_v, 3)} V` : "–"],
+      ["phase", seen.window ? `${num(seen.window.phase_deg, 3)}° (${seen.window.phase})` : "–"],
+      ["threshold", seen.window?.threshold_v ? `${num(seen.window.threshold_v, 3)} V` : "–"]];
+    values.replaceChildren(...pairs.flatMap(([k, v]) => [h("dt", {}, k), h("dd", {}, v)]));
+  }
+  function drawWave(event) {
+    const [rows, columns] = event.shape, pressure = event.channels.map((c, i) => i).filter((i) => event.units[i] === "Pa").slice(0, 2);
+    const time = Float64Array.from({ length: rows }, (_, i) => 1000 * i / event.rate_hz);
+    const pick = (c) => Float64Array.from({ length: rows }, (_, i) => event.samples[i * columns + c]);
+    const chosen = pressure.length === 2 ? pressure : [0, Math.min(1, columns - 1)];
+    const [a, b] = chosen.map(pick);
+    wave.set([time, a, b]);
+    const beat = rig().window?.frequency_hz ?? rig().free?.frequency_hz ?? 170;
+    const lag = Math.max(1, Math.round(event.rate_hz / beat / 4));
+    portrait.draw([...a.slice(lag)], [...a.slice(0, -lag)]);
+  }
+  function drawSpectrum(event) {
+    const [rows, columns] = event.shape;
+    const frequency = Float64Array.from({ length: rows }, (_, i) => i * event.step_hz);
+    spectrum.set([frequency, ...[0, Math.min(1, columns - 1)].map((c) => Float64Array.from({ length: rows }, (_, i) => event.samples[i * columns + c]))]);
+  }
+  function drawTongue(seen) {
+    const points = [];
+    for (const [index, one] of seen.conditions) {
+      if (!one.frequency_hz || one.cold || one.kind === "cold") continue;
+      const what = `condition ${index}: ${num(one.frequency_hz, 6)} Hz, ${num(one.drive_v, 3)} V, ${one.state}`;
+      if (one.threshold_v) points.push({ x: one.frequency_hz, y: one.threshold_v, colour: "--c1", hollow: true, label: `condition ${index}: threshold ${num(one.threshold_v, 3)} V` });
+      if (one.drive_v > 0) points.push({ x: one.frequency_hz, y: one.drive_v, colour: one.state === "entrained" ? "--good" : one.state === "approaching" ? "--warn" : "--bad", cross: !["entrained", "approaching"].includes(one.state), label: what });
+    }
+    const key_ = JSON.stringify(points) + seen.free?.frequency_hz;
+    if (key_ === tongueKey) return;
+    tongueKey = key_;
+    const lines = seen.free ? [{ points: [[seen.free.frequency_hz, 0], [seen.free.frequency_hz, Math.max(0.1, ...points.map((p) => p.y))]], colour: "--c3", dash: true, label: "limit cycle" }] : [];
+    tongue.replaceChildren(scatter({ label: "Lock-in tongue: drive against frequency", x: "forcing frequency (Hz)", y: "drive (V)", points, lines, width: 400, height: 250 }));
+    const done = [...seen.conditions.values()].filter((one) => one.state === "entrained").length;
+    tongueText.textContent = points.length ? `${done} entrained; filled: recorded, ring: threshold, cross: not entrained, dashed: limit cycle` : "fills up as the campaign proceeds";
+  }
+
+  const stopWatching = model.watch(draw);
+  const timer = setInterval(refresh, 3000);
+  draw();
+  const content = h("div", { class: "grid" },
+    card("w8", "Rig", h("div", { class: "row" }, picker, state, h("span", { class: "spacer" }), control, reset, watch), h("p", {}), progress, message, h("div", { class: "row" }, Object.values(buttons))),
+    h("section", { class: "card w4 livecard", "aria-label": "Criterion" }, h("h2", {}, "Limit cycle against its free level"), gaugeText, gauge, gaugeNote, values),
+    h("section", { class: "card w8 livecard", "aria-label": "Spectrum" }, h("h2", {}, "Spectrum"), spectrum.root),
+    h("section", { class: "card w4 livecard", "aria-label": "Levels" }, h("h2", {}, "Levels against limits"), meters),
+    h("section", { class: "card w5 livecard", "aria-label": "Waveform" }, h("h2", {}, "Waveform"), wave.root),
+    h("section", { class: "card w3 livecard", "aria-label": "Phase portrait" }, h("h2", {}, "Phase portrait"), portrait.canvas),
+    h("section", { class: "card w4 livecard", "aria-label": "Tongue" }, h("h2", {}, "Lock-in tongue"), tongue, tongueText),
+    card("", "Log", log));
+  return { title: `Live: ${name}`, content, close: () => { stopWatching(); clearInterval(timer); } };
+}

@@ -1,0 +1,1 @@
+"""Devices: what they are called, what they can do, and how they fail."""

@@ -1,0 +1,27 @@
+"""Identification of a self-excited loop, and tracing of what its model lacks.
+
+A pure library: arrays in, results out. `identify(campaign)` fits the declared model, `diagnose`
+says what it lacks. See `identify.record` for what a campaign is, `identify.structure` for what a
+model is made of, `identify.effects` for the candidates.
+"""
+
+from identify.diagnosis import diagnose
+from identify.identification import identify
+from identify.record import Campaign, DeclaredModel, Medium, Run, Signal
+from identify.results import Assessment, Diagnosis, Identification
+from identify.structure import Effect, Structure
+
+__all__ = [
+    "Assessment",
+    "Campaign",
+    "DeclaredModel",
+    "Diagnosis",
+    "Effect",
+    "Identification",
+    "Medium",
+    "Run",
+    "Signal",
+    "Structure",
+    "diagnose",
+    "identify",
+]

@@ -1,0 +1,387 @@
+"""Periodic steady states of the loop by harmonic balance, with exact parameter derivatives.
+
+Unknowns are the Fourier coefficients of every nonlinearity's input, v_a,k (k = 1…K), collected in
+real form x = [Re v, Im v]. The balance (Section 4.3 of the thesis)
+
+    R_a,k = v_a,k − Σ_b P_ab(jkω) N̂_b,k(v_b) − Q_a(jkω) = 0
+
+is solved by Newton's method, all runs of a campaign at once; N̂ is taken through 4K or more time
+samples a period. A free run has a free phase, fixed by Im v_0,1 = 0, and an unknown ω in its
+place. Started from the measured orbit, Newton stays on the measured branch where several exist.
+
+Derivatives come from the implicit function theorem, ∂x/∂θ = −R_x⁻¹ R_θ, with R_θ by automatic
+differentiation of the assembled equations: exact, and the solver itself is never differenced.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import dual
+from identify.dual import Dual
+from identify.structure import Characteristic, Conditions, Loop, Preceded, Structure, Values
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+
+TOLERANCE = 1e-10  # relative Newton residual: far below any noise, above rounding
+MAX_ITERATIONS = 12
+FINE = 512  # samples a period of a `Preceded` characteristic: turning points to 2e-5 of the swing
+
+
+@lru_cache(maxsize=32)
+def _period(harmonics: int, samples: int | None = None) -> tuple[FloatArray, ComplexArray]:
+    """Matrices to and from time samples over one period: (T, 2K) and (K, T)."""
+    samples = samples or max(64, 8 * harmonics)
+    tau = 2 * np.pi * np.arange(samples) / samples
+    angle = np.outer(tau, np.arange(1, harmonics + 1))
+    to_time = np.hstack([np.cos(angle), -np.sin(angle)])
+    to_harmonics = (2.0 / samples) * np.exp(-1j * angle.T)
+    return to_time, to_harmonics
+
+
+def to_time(c: Any, harmonics: int, samples: int | None = None) -> Any:
+    """Time samples (runs, T) over one period of Σ Re c_k e^{jkτ}; `c` an array or a Dual."""
+    matrix = _period(harmonics, samples)[0]
+    if isinstance(c, Dual):
+        stacked = np.concatenate([c.v.real, c.v.imag], axis=1) @ matrix.T
+        d = np.broadcast_to(c.d, (*c.v.shape, c.d.shape[-1]))
+        both = np.concatenate([d.real, d.imag], axis=1)
+        return Dual(stacked, np.einsum("tk,rkp->rtp", matrix, both, optimize=True))
+    return np.concatenate([c.real, c.imag], axis=1) @ matrix.T
+
+
+def to_harmonics(x: Any, harmonics: int, samples: int | None = None) -> Any:
+    """Fourier coefficients (runs, K) of time samples over one period; the mean is dropped."""
+    matrix = _period(harmonics, samples)[1]
+    if isinstance(x, Dual):
+        d = np.broadcast_to(x.d, (*x.v.shape, x.d.shape[-1]))
+        return Dual(x.v @ matrix.T, np.einsum("kt,rtp->rkp", matrix, d, optimize=True))
+    return x @ matrix.T
+
+
+@dataclass(frozen=True)
+class Orbits:
+    """Steady states of a batch of runs.
+
+    `inputs`: nonlinearity inputs (loops, runs, K); `velocity`: predicted measurement (runs, K);
+    `omega`: rad/s (solved for in free runs); `converged`: (runs,). With derivatives asked for,
+    `d_velocity` is (runs, K, p), `d_omega` (runs, p) and `d_inputs` (loops, runs, K, p), with
+    respect to the unknowns.
+    """
+
+    inputs: ComplexArray
+    velocity: ComplexArray
+    omega: FloatArray
+    converged: BoolArray
+    d_velocity: ComplexArray | None = None
+    d_omega: FloatArray | None = None
+    d_inputs: ComplexArray | None = None
+
+    def take(self, part: npt.NDArray[np.int64]) -> "Orbits":
+        """Some of the rows."""
+        return Orbits(
+            self.inputs[:, part],
+            self.velocity[part],
+            self.omega[part],
+            self.converged[part],
+            None if self.d_velocity is None else self.d_velocity[part],
+            None if self.d_omega is None else self.d_omega[part],
+            None if self.d_inputs is None else self.d_inputs[:, part],
+        )
+
+
+def solve(
+    structure: Structure,
+    theta: FloatArray,
+    at: Conditions,
+    *,
+    free: bool,
+    start: ComplexArray | None = None,
+    start_omega: FloatArray | None = None,
+    derivatives: bool = False,
+    iterations: int = MAX_ITERATIONS,
+) -> Orbits:
+    """Steady states of one batch, all forced (or cold), or all free.
+
+    Parameters
+    ----------
+    theta : internal parameters, (p,), or (vectors, p) for several at once: the orbits' rows are
+        then vector by vector, the runs of `at` in each.
+    at : conditions; in a free batch `at.omega` is where the search for ω starts.
+    start : nonlinearity inputs to start from, (loops, rows, K); default: from the measured
+        velocity. A row that does not converge from `start` is tried from the measurement too.
+    start_omega : where the search for ω starts instead, (rows,).
+    iterations : at most that many Newton steps. Few of them give an approximate orbit, marked
+        as not converged, for a search that is still far from any solution.
+    """
+    vectors = theta[None] if theta.ndim == 1 else theta
+    rows = at.tile(vectors.shape[0])
+    values = structure.parameters.plain(vectors, at.runs)
+    begin = rows if start_omega is None else replace(rows, omega=start_omega)
+    first = _inputs_from_velocity(structure, values, rows) if start is None else start
+    orbits = _newton(structure, values, begin, first, free, iterations)
+    if start is not None and not orbits.converged.all():
+        again = np.flatnonzero(~orbits.converged)
+        some = {n: v[again] for n, v in values.items()}
+        fewer = rows.take(again)
+        measured = _inputs_from_velocity(structure, some, fewer)
+        orbits = _merge(orbits, _newton(structure, some, fewer, measured, free, iterations), again)
+    return differentiate(structure, vectors, at, orbits, free=free) if derivatives else orbits
+
+
+def differentiate(
+    structure: Structure, vectors: FloatArray, at: Conditions, orbits: Orbits, *, free: bool
+) -> Orbits:
+    """The same orbits with derivatives by the unknowns; arguments as given to `solve`."""
+    rows = at.tile(vectors.shape[0])
+    values = structure.parameters.plain(vectors, at.runs)
+    return _differentiate(structure, vectors, values, rows, at.runs, orbits, free)
+
+
+def _inputs_from_velocity(structure: Structure, values: Values, at: Conditions) -> ComplexArray:
+    """Nonlinearity inputs implied by the measured velocity: the start on the measured branch."""
+    k = np.arange(1, at.harmonics + 1)
+    loop = structure.assemble(values, at, 1j * at.omega[:, None] * k)
+    w = np.asarray(loop.H * at.velocity, dtype=complex)
+    return np.stack([w] + [at.velocity.copy() for _ in loop.N[1:]])
+
+
+def _newton(
+    structure: Structure, p: Values, at: Conditions, start: ComplexArray, free: bool, limit: int
+) -> Orbits:
+    K = at.harmonics
+    k = np.arange(1, K + 1)
+    v = start.copy()
+    omega = at.omega.copy()
+    if free:
+        turn = np.exp(-1j * np.angle(v[0, :, :1]) * k)
+        v = v * turn
+    loop = structure.assemble(p, at, 1j * omega[:, None] * k)
+    error = np.full(at.runs, np.inf)
+    with np.errstate(all="ignore"):
+        for _ in range(limit):
+            if free:
+                loop = structure.assemble(p, at, 1j * omega[:, None] * k)
+            R = np.stack(_residual(loop, v, K))
+            size = np.sqrt(np.sum(np.abs(v) ** 2, axis=2)) + 1e-300
+            error = np.max(np.sqrt(np.sum(np.abs(R) ** 2, axis=2)) / size, axis=0)
+            error = np.where(np.isfinite(error), error, np.inf)
+            if np.all((error < TOLERANCE) | ~np.isfinite(error)):
+                break
+            slopes = [_force_jacobian(n, x, K) for n, x in zip(loop.N, v, strict=True)]
+            J = _jacobian(loop, slopes, K)
+            if free:  # the column of Im v_0,1, which stays 0, becomes ω's
+                nudge = 1e-7 * omega
+                moved = structure.assemble(p, at, 1j * (omega + nudge)[:, None] * k)
+                ahead = np.stack(_residual(moved, v, K))
+                J[:, :, K] = _stack((ahead - R) / nudge[None, :, None])
+            step = _solve(J, _stack(R))
+            # A full Newton step far outside the orbit's size is a step off the branch: damp it.
+            turn_rate = np.clip(step[:, K], -0.05 * omega, 0.05 * omega)
+            if free:
+                step[:, K] = 0.0
+                omega = omega - turn_rate
+            length = np.max(np.abs(step), axis=1) / np.max(size, axis=0)
+            step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
+            v = v - _unstack(step, v.shape)
+    converged = error < 1e-8
+    predicted = np.asarray(velocity(loop, v, K))
+    return Orbits(v, predicted, omega, converged & np.isfinite(predicted).all(axis=1))
+
+
+def residual(structure: Structure, values: Values, at: Conditions, v: ComplexArray) -> ComplexArray:
+    """The balance R of forced runs at any inputs `v`, both (loops, runs, K)."""
+    s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
+    return np.stack(_residual(structure.assemble(values, at, s), v, at.harmonics))
+
+
+def _residual(loop: Loop, v: Any, K: int) -> list[Any]:
+    forces = [_force(n, x, K) for n, x in zip(loop.N, v, strict=True)]
+    return _balance(loop, v, forces)
+
+
+def _balance(loop: Loop, v: Any, forces: Sequence[Any]) -> list[Any]:
+    out = []
+    for a, row in enumerate(loop.P):
+        total: Any = v[a] - loop.Q[a]
+        for P, F in zip(row, forces, strict=True):
+            total = total - P * F
+        out.append(total)
+    return out
+
+
+def velocity(loop: Loop, v: Any, K: int) -> Any:
+    total: Any = loop.G_u
+    for G, n, x in zip(loop.G, loop.N, v, strict=True):
+        total = total + G * _force(n, x, K)
+    return loop.sensor(total)
+
+
+def slope_along(n: Characteristic, x: FloatArray) -> FloatArray:
+    """N′ at time samples, by automatic differentiation with respect to the input."""
+    out = n(Dual(x, np.ones((*x.shape, 1))))
+    return np.asarray(dual.derivative(out, x.shape, 1)[..., 0], dtype=float)
+
+
+def _force(n: Characteristic, v: Any, K: int) -> Any:
+    """N̂, the Fourier coefficients of one nonlinearity's output."""
+    if isinstance(n, Preceded):
+        return to_harmonics(n.periodic(to_time(v, K, FINE)), K, FINE)
+    return to_harmonics(n(to_time(v, K)), K)
+
+
+def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
+    """∂N̂/∂x of one nonlinearity, (runs, K, 2K)."""
+    if isinstance(n, Preceded):  # an output depends on inputs of other times
+        back, forth = _period(K, FINE)
+        out = n.periodic(Dual(to_time(v, K, FINE), np.broadcast_to(back, (len(v), *back.shape))))
+        return np.asarray(forth @ dual.derivative(out, (len(v), FINE), 2 * K))
+    back, forth = _period(K)
+    slope = slope_along(n, to_time(v, K))
+    return np.asarray((forth[None] * slope[:, None, :]) @ back)
+
+
+def _jacobian(loop: Loop, slopes: Sequence[ComplexArray], K: int) -> FloatArray:
+    """∂R/∂x in real form, (runs, 2KL, 2KL) for L loops, unknowns loop by loop.
+
+    `slopes` are the ∂N̂/∂x of each nonlinearity.
+    """
+    loops, runs = len(slopes), slopes[0].shape[0]
+    J = np.zeros((runs, 2 * K * loops, 2 * K * loops))
+    for b in range(loops):
+        for a in range(loops):
+            block = -np.broadcast_to(loop.P[a][b], (runs, K))[:, :, None] * slopes[b]
+            rows, cols = slice(2 * K * a, 2 * K * (a + 1)), slice(2 * K * b, 2 * K * (b + 1))
+            J[:, rows, cols] = np.concatenate([block.real, block.imag], axis=1)
+    J[:, np.arange(2 * K * loops), np.arange(2 * K * loops)] += 1.0
+    return J
+
+
+def _differentiate(
+    structure: Structure,
+    vectors: FloatArray,
+    plain_values: Values,
+    at: Conditions,
+    runs_each: int,
+    orbits: Orbits,
+    free: bool,
+) -> Orbits:
+    K, runs, p = at.harmonics, at.runs, vectors.shape[1]
+    k = np.arange(1, K + 1)
+    seeds = p + int(free)
+    values = structure.parameters.seeded(vectors, runs_each, extra=int(free))
+    s: Any = 1j * orbits.omega[:, None] * k
+    if free:
+        ds = np.zeros((runs, K, seeds), dtype=complex)
+        ds[:, :, p] = 1j * k
+        s = Dual(s, ds)
+    loop = structure.assemble(values, at, s)
+    v = orbits.inputs
+    plain = structure.assemble(plain_values, at, dual.value(s))
+    forces = [_force(n, x, K) for n, x in zip(loop.N, v, strict=True)]
+    slopes = [_force_jacobian(n, x, K) for n, x in zip(plain.N, v, strict=True)]
+    R = _balance(loop, v, forces)
+    explicit = np.stack([np.asarray(dual.derivative(r, (runs, K), seeds)) for r in R])
+    right = np.concatenate([np.concatenate([x.real, x.imag], axis=1) for x in explicit], axis=1)
+    J = _jacobian(plain, slopes, K)
+    dx = np.zeros_like(right)
+    d_omega = None
+    if free:
+        J[:, :, K] = right[:, :, p]
+        solved = -_solve(J, right[:, :, :p])
+        d_omega = solved[:, K, :].copy()
+        solved[:, K, :] = 0.0
+        dx[:, :, :p] = solved
+    else:
+        dx = -_solve(J, right)
+    total: Any = loop.G_u
+    for b, (G, F) in enumerate(zip(loop.G, forces, strict=True)):
+        inner = slopes[b] @ dx[:, 2 * K * b : 2 * K * (b + 1)]
+        total = total + G * Dual(dual.value(F), dual.derivative(F, (runs, K), seeds) + inner)
+    y = loop.sensor(total)
+    dy = np.array(dual.derivative(y, (runs, K), seeds), dtype=complex)
+    if d_omega is not None:  # chain rule through the free frequency
+        dy = dy[:, :, :p] + dy[:, :, p:] * d_omega[:, None, :]
+    d_inputs = np.stack(
+        [
+            dx[:, 2 * K * a : 2 * K * a + K, :p] + 1j * dx[:, 2 * K * a + K : 2 * K * (a + 1), :p]
+            for a in range(v.shape[0])
+        ]
+    )
+    return Orbits(v, dual.value(y), orbits.omega, orbits.converged, dy, d_omega, d_inputs)
+
+
+def drive_sensitivity(
+    structure: Structure, theta: FloatArray, at: Conditions, orbits: Orbits
+) -> FloatArray:
+    """∂[Re Y, Im Y]/∂[Re U, Im U] of forced runs, (runs, 2K, 2K): how an error of the recorded
+    drive shows in the prediction. Exact where the drive enters linearly."""
+    K = at.harmonics
+    s = 1j * orbits.omega[:, None] * np.arange(1, K + 1)
+    values = structure.parameters.plain(theta)
+    # the equations are linear in the drive: with a drive of one they give its transfer functions
+    unit = structure.assemble(values, replace(at, drive=np.ones_like(at.drive)), s)
+    loop = structure.assemble(values, at, s)
+    slopes = [_force_jacobian(n, x, K) for n, x in zip(loop.N, orbits.inputs, strict=True)]
+    entering = np.concatenate([_diagonal(q, at.runs, K) for q in unit.Q], axis=1)
+    dv = _solve(_jacobian(loop, slopes, K), entering)
+    direct = _diagonal(unit.G_u, at.runs, K)
+    total: ComplexArray = direct[:, :K] + 1j * direct[:, K:]
+    for b, G in enumerate(loop.G):
+        inner = slopes[b] @ dv[:, 2 * K * b : 2 * K * (b + 1)]
+        total = total + np.broadcast_to(G, (at.runs, K))[:, :, None] * inner
+    nudge = 1e-6 * np.abs(orbits.velocity[:, :1])
+    seen = (loop.sensor(orbits.velocity + nudge) - loop.sensor(orbits.velocity)) / nudge
+    total = np.asarray(seen)[:, :, None] * total
+    return np.concatenate([total.real, total.imag], axis=1)
+
+
+def _diagonal(c: Any, runs: int, K: int) -> FloatArray:
+    """Multiplication by complex `c` (runs, K) in real form, (runs, 2K, 2K)."""
+    c = np.broadcast_to(c, (runs, K))
+    out = np.zeros((runs, 2 * K, 2 * K))
+    k = np.arange(K)
+    out[:, k, k] = out[:, K + k, K + k] = c.real
+    out[:, k, K + k], out[:, K + k, k] = -c.imag, c.imag
+    return out
+
+
+def _stack(c: ComplexArray) -> FloatArray:
+    """(loops, runs, K) complex to (runs, 2K·loops) real."""
+    return np.concatenate([np.concatenate([x.real, x.imag], axis=1) for x in c], axis=1)
+
+
+def _unstack(x: FloatArray, shape: Sequence[int]) -> ComplexArray:
+    loops, _, K = shape
+    parts = [x[:, 2 * K * a : 2 * K * (a + 1)] for a in range(loops)]
+    return np.stack([q[:, :K] + 1j * q[:, K:] for q in parts])
+
+
+def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
+    """Batched solve; a singular member yields NaN in its own row instead of an exception."""
+    vector = right.ndim == 2
+    rhs = right[..., None] if vector else right
+    try:
+        out = np.linalg.solve(matrix, rhs)
+    except np.linalg.LinAlgError:
+        out = np.full(rhs.shape, np.nan)
+        for i, (m, r) in enumerate(zip(matrix, rhs, strict=True)):
+            try:
+                out[i] = np.linalg.solve(m, r)
+            except np.linalg.LinAlgError:
+                continue
+    return np.asarray(out[..., 0] if vector else out)
+
+
+def _merge(orbits: Orbits, other: Orbits, rows: npt.NDArray[np.int64]) -> Orbits:
+    inputs, velocity = orbits.inputs.copy(), orbits.velocity.copy()
+    omega, converged = orbits.omega.copy(), orbits.converged.copy()
+    inputs[:, rows], velocity[rows] = other.inputs, other.velocity
+    omega[rows], converged[rows] = other.omega, other.converged
+    return Orbits(inputs, velocity, omega, converged)

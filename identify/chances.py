@@ -1,0 +1,43 @@
+"""Tail probabilities and rank correlation, from `scipy.special`.
+
+`scipy.stats` has them too, and takes longer to import than everything else here together.
+"""
+
+import numpy as np
+import numpy.typing as npt
+from scipy import special
+
+
+def chi2_tail(x: float, dof: float) -> float:
+    """P(χ² with `dof` degrees of freedom > x)."""
+    return float(special.chdtrc(dof, max(x, 0.0)))
+
+
+def chi2_tails(x: npt.NDArray[np.float64], dof: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """The same for arrays that broadcast."""
+    return np.asarray(special.chdtrc(dof, np.maximum(x, 0.0)))
+
+
+def f_tail(x: float, dof_above: float, dof_below: float) -> float:
+    """P(F > x) of Fisher's ratio."""
+    return float(special.fdtrc(dof_above, dof_below, max(x, 0.0)))
+
+
+def rank_correlation(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[float, float]:
+    """Spearman's ρ and its two-sided p-value (Student's t with n − 2); NaN for a constant."""
+    x, y = _ranks(a), _ranks(b)
+    x, y = x - x.mean(), y - y.mean()
+    size = float(np.sqrt((x @ x) * (y @ y)))
+    dof = x.size - 2
+    if size == 0 or dof < 1:
+        return float("nan"), float("nan")
+    rho = float(np.clip(x @ y / size, -1.0, 1.0))
+    t = abs(rho) * np.sqrt(dof / max(1 - rho**2, 1e-300))
+    return rho, float(2 * special.stdtr(dof, -t))
+
+
+def _ranks(values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Ranks from 1, equal values sharing their mean rank."""
+    _, inverse, count = np.unique(values, return_inverse=True, return_counts=True)
+    last = np.cumsum(count)
+    return np.asarray((last - 0.5 * (count - 1))[inverse.ravel()], dtype=float)

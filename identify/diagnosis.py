@@ -1,0 +1,326 @@
+"""`diagnose`: what the declared model lacks, with evidence, or an honest «unexplained».
+
+Order: data quality → lack of fit against noise (if there is none, stop) → candidates added,
+refitted, compared, validated (`identify.trace`) → verdict. A foreign tone that stands in most
+runs never touches the harmonics compared; it is an effect of the sensors found in the spectrum.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from identify import assess, design, drive, start, trace
+from identify.chances import rank_correlation
+from identify.dataset import Dataset
+from identify.effects import CANDIDATES, CATALOGUE
+from identify.executor import Executor, one_thread
+from identify.fit import Fit
+from identify.identification import Prepared, prepare
+from identify.parameters import Estimate
+from identify.quality import Tone
+from identify.record import Campaign
+from identify.results import (
+    Assessment,
+    Candidate,
+    Diagnosis,
+    Residual,
+    TracedEffect,
+    Verdict,
+)
+from identify.structure import Effect, Structure
+from identify.trace import ALPHA, Cancelled, Tried
+
+Progress = Callable[[float, str], None]
+
+SHOWN = 12  # candidates in the report
+
+
+@one_thread
+def diagnose(
+    campaign: Campaign,
+    *,
+    structure: Structure | None = None,
+    progress: Progress | None = None,
+    cancel: Callable[[], bool] | None = None,
+    executor: Executor | None = None,
+    catalogue: Sequence[Effect] = CANDIDATES,
+) -> Diagnosis:
+    """Fit the declared model, trace what it lacks, refit, and say so.
+
+    Parameters
+    ----------
+    progress : called with (share done, what is being done).
+    cancel : asked now and then; True raises `identify.trace.Cancelled`.
+    catalogue : effects to consider.
+
+    Raises what `identify.identification.prepare` raises for data that cannot be used.
+    """
+    began = time.perf_counter()
+
+    def report(share: float, text: str) -> None:
+        if cancel is not None and cancel():
+            raise Cancelled("the diagnosis was cancelled by its caller")
+        if progress is not None:
+            progress(share, text)
+
+    report(0.0, "measuring harmonics")
+    ready = prepare(campaign, structure)
+    report(0.05, "fitting the declared model")
+    recorded = ready.data
+    data, fit = drive.refitted(start.fit_from_data(ready.structure, recorded), recorded)
+    ready = replace(ready, data=data)
+    declared = _declared(fit, ready, catalogue)
+    tried: list[Tried] = []
+    if declared.significant:
+        found = trace.search(
+            ready.structure,
+            data,
+            declared.fit,
+            executor=executor,
+            progress=lambda share, text: report(0.15 + 0.8 * share, text),
+            catalogue=catalogue,
+        )
+        tried = list(found.tried)
+        known = [t for t in tried if t.plausible and t.fit.converged]
+        if known and not any(t.adequate for t in tried):
+            # the best of them knows better than the declared fit how the drive's errors show
+            best = min(known, key=lambda t: t.fit.chi2)
+            better, fit = drive.refitted(declared.fit, recorded, best.fit)
+            if better is not recorded:
+                data, ready = better, replace(ready, data=better)
+                declared = _declared(fit, ready, catalogue)
+                tried = trace.refitted(tried, data)
+        # what an effect explains, a better start of the declared model may explain without it
+        once_more = trace.without_effects(ready.structure, data, tried)
+        if once_more is not None and _better(once_more, declared.fit):
+            declared = _declared(once_more, ready, catalogue)
+    base, before = declared.fit, declared.assessment
+    tones = _tone_effects(ready.quality.tones)
+    residual = Residual(
+        declared.significant or bool(tones), declared.p_value, signature(before, declared.scores)
+    )
+    if not declared.significant:
+        tried = []
+    verdict, chosen, explanation = _judge(declared.significant, tried, base.chi2, data)
+    if tones and verdict in ("no_discrepancy", "traced"):
+        verdict = "traced"
+        explanation += " A foreign tone stands in the channels of most runs."
+    after = before if chosen is None else assess.assess(chosen.fit, data)
+    claimed = verdict in ("traced", "ambiguous") and chosen is not None
+    effects = (*_traced(chosen), *tones) if claimed and chosen else tuple(tones)
+    report(1.0, "done")
+    return Diagnosis(
+        campaign=campaign.identifier or campaign.title,
+        declared_model=campaign.declared_model,
+        quality=ready.quality.flags,
+        before=before,
+        residual=residual,
+        candidates=_candidates(tried, chosen, base.chi2, base.theta.size),
+        verdict=verdict,
+        effects=effects,
+        after=after,
+        next_experiment=_next(ready, verdict, tried, chosen),
+        seconds=time.perf_counter() - began,
+        explanation=explanation,
+    )
+
+
+def _better(new: Fit, old: Fit) -> bool:
+    """Another minimum rather than the same one reached less tidily."""
+    return new.chi2 < (1.0 if new.converged else 0.9) * old.chi2 - 1.0
+
+
+@dataclass(frozen=True)
+class _Declared:
+    """A fit of the declared model, and whether it leaves more than noise."""
+
+    fit: Fit
+    assessment: Assessment
+    scores: dict[str, trace.ScoreTest]
+    p_value: float
+
+    @property
+    def significant(self) -> bool:
+        return self.p_value < ALPHA
+
+
+def _declared(fit: Fit, ready: Prepared, catalogue: Sequence[Effect]) -> _Declared:
+    assessment = assess.assess(fit, ready.data)
+    scores = _scores(ready.structure, ready.data, assessment, catalogue)
+    held = _validation_p(assessment, ready.data)
+    p_value = min(
+        assess.lack_of_fit_p(fit.chi2, fit.dof),
+        held if np.isfinite(held) else 1.0,
+        trace.family_p(list(scores.values())),
+    )
+    return _Declared(fit, assessment, scores, p_value)
+
+
+def _validation_p(before: Assessment, data: Dataset) -> float:
+    held = [assess.predict(before.structure, before.fit.theta, b) for b in data.validation]
+    return assess.validation_p(held, before.fit.covariance) if held else float("nan")
+
+
+def _scores(
+    structure: Structure, data: Dataset, before: Assessment, catalogue: Sequence[Effect]
+) -> dict[str, trace.ScoreTest]:
+    if not before.fit.converged:
+        return {}
+    usable = [e for e in catalogue if trace.usable(e, data, structure)]
+    found = {e.key: trace.score_test(structure, data, before.fit, e) for e in usable}
+    return {k: s for k, s in found.items() if s is not None}
+
+
+def signature(assessment: Assessment, scores: Mapping[str, trace.ScoreTest]) -> dict[str, Any]:
+    """What the residual looks like: rms in noise units by harmonic, run, kind and parity, and the
+    effects along whose tangents it lies (share of χ² that a small effect would take away)."""
+    rows = [c for c in assessment.comparisons if c.role == "fit"]
+    size = [np.abs(c.normalised) for c in rows]
+    if not rows or not all(np.isfinite(s).all() for s in size):
+        return {}
+    table = np.stack([s[: min(len(q) for q in size)] for s in size])
+    order = np.argsort([c.started_s for c in rows])
+    by_run = np.sqrt(np.mean(table**2, axis=1))
+    forced = [i for i, c in enumerate(rows) if c.kind == "forced"]
+    out: dict[str, Any] = {
+        "by_harmonic": [float(x) for x in np.sqrt(np.mean(table**2, axis=0))],
+        "by_run": {c.run: float(x) for c, x in zip(rows, by_run, strict=True)},
+        "odd": float(np.sqrt(np.mean(table[:, 0::2] ** 2))),
+        "even": float(np.sqrt(np.mean(table[:, 1::2] ** 2))) if table.shape[1] > 1 else None,
+    }
+    for kind in ("forced", "free", "cold"):
+        members = [i for i, c in enumerate(rows) if c.kind == kind]
+        if members:
+            out[kind] = float(np.sqrt(np.mean(table[members] ** 2)))
+    if len(forced) >= 4:
+        amplitude = [rows[i].amplitude_v for i in forced]
+        out["correlation"] = {
+            "run_order": _rank_correlation(by_run[order], np.arange(len(order))),
+            "amplitude": _rank_correlation(by_run[forced], np.array(amplitude)),
+            "frequency": _rank_correlation(
+                by_run[forced], np.array([rows[i].frequency_hz for i in forced])
+            ),
+        }
+    total = float(np.sum(assessment.fit.residual**2))
+    ranked = sorted(scores.items(), key=lambda item: -item[1].drop)[:8]
+    out["tangents"] = {
+        key: {"explains": s.drop / total, "unabsorbed": s.share, "p_value": s.p_value}
+        for key, s in ranked
+    }
+    return out
+
+
+def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float | None:
+    if np.ptp(a) == 0 or np.ptp(b) == 0:
+        return None
+    value = rank_correlation(a, b)[0]
+    return value if np.isfinite(value) else None
+
+
+def _judge(
+    significant: bool, tried: Sequence[Tried], base_chi2: float, data: Dataset
+) -> tuple[Verdict, Tried | None, str]:
+    """Verdict, the candidate it rests on, and the reason in words."""
+    if not significant:
+        return "no_discrepancy", None, "The declared model explains the data to within noise."
+    good = [t for t in tried if t.adequate and t.plausible]
+    if good:
+        best = trace.best_form(good)
+        others = trace.rivals(best, trace.best_by_name(good))
+        words = " + ".join(best.names)
+        if not others:
+            return "traced", best, f"Adding {words} explains the data; no rival does."
+        names = ", ".join(" + ".join(t.names) for t in others)
+        return "ambiguous", best, f"{words} explains the data, and so does: {names}."
+    ranked = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)
+    near = _nearly(ranked, base_chi2, data)
+    if near is not None:
+        words = " + ".join(near.names)
+        return "traced", near, (
+            f"Adding {words} takes away all but a trace of the misfit and predicts the validation "
+            f"runs as well as noise permits; χ²/dof {near.fit.chi2_per_dof:.2g} is left."
+        )  # fmt: skip
+    chosen = ranked[0] if ranked else None
+    left = "" if chosen is None else (
+        f" The best, {' + '.join(chosen.names)}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
+        "it is reported, not claimed."
+    )  # fmt: skip
+    return "unexplained", chosen, "No known effect explains the data to within noise." + left
+
+
+def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried | None:
+    """A candidate that leaves a statistically visible but practically empty residual.
+
+    It must take away 99.8 % of the excess misfit, predict held-out runs within 1.5 times the
+    noise, and stand ten times better than any other effect: an idealisation (a slightly other
+    law of the same effect) may then remain, another cause hardly.
+    """
+    if not ranked or not data.validation:
+        return None
+    best, floor = ranked[0], data.noise_floor(data.validation)
+    others = [t.fit.chi2 for t in ranked if t.key != best.key and len(t.key) <= len(best.key)]
+    excess = max(best.fit.chi2 - best.fit.dof, 0.0)
+    if (
+        len(best.effects) == 1
+        and best.fit.converged
+        and best.fit.chi2_per_dof < 3.0
+        and excess < 0.002 * (base_chi2 - best.fit.dof)
+        and best.validation_error < 1.5 * floor
+        and (not others or min(others) > 10 * best.fit.chi2)
+    ):
+        return best
+    return None
+
+
+def _candidates(
+    tried: Sequence[Tried], chosen: Tried | None, base_chi2: float, base_parameters: int
+) -> tuple[Candidate, ...]:
+    ordered = trace.best_by_name(tried)
+    good = [t for t in ordered if t.adequate and t.plausible]
+    if chosen is not None:  # what the verdict rests on stands first
+        ordered = [chosen, *(t for t in ordered if t.key != chosen.key)]
+    out = []
+    for t in ordered[:SHOWN]:
+        equal = [" + ".join(o.names) for o in trace.rivals(t, good)] if t in good else []
+        out.append(trace.candidate(t, base_chi2, base_parameters, len(CATALOGUE), equal))
+    return tuple(out)
+
+
+def _traced(chosen: Tried) -> tuple[TracedEffect, ...]:
+    estimates = chosen.estimates
+    return tuple(
+        TracedEffect(e.name, e.location, e.form, {q.name: estimates[q.name] for q in e.parameters})
+        for e in chosen.effects
+    )
+
+
+def _tone_effects(tones: Sequence[Tone]) -> tuple[TracedEffect, ...]:
+    """Foreign tones as the effect `interference`."""
+    return tuple(
+        TracedEffect(
+            "interference",
+            "sensor",
+            "tone",
+            {
+                "interference.frequency_hz": Estimate(t.frequency_hz, 0.0, "Hz"),
+                "interference.amplitude": Estimate(t.amplitude, t.stderr, t.unit),
+            },
+        )
+        for t in tones
+    )
+
+
+def _next(
+    ready: Prepared, verdict: Verdict, tried: Sequence[Tried], chosen: Tried | None
+) -> Mapping[str, Any] | None:
+    """What to measure to tell the rivals apart, or to see the unexplained rest."""
+    if chosen is None or verdict not in ("ambiguous", "unexplained"):
+        return None
+    best = trace.best_by_name(tried)
+    others = trace.rivals(chosen, best) if verdict == "ambiguous" else best
+    group = [chosen, *(t for t in others if t.plausible and t.key != chosen.key)]
+    rivals = [design.Rival(" + ".join(t.names), t.fit) for t in group]
+    return design.next_experiment(rivals, ready, verdict)

@@ -1,0 +1,190 @@
+"""Actuator: what stands between the recorded drive and the sound at the speaker."""
+
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import balance, dual
+from identify.parameters import Parameter
+from identify.structure import Conditions, Effect, Known, Values
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+
+
+class SpeakerResonance(Effect):
+    """A second-order speaker: ω²/(s² + 2ζωs + ω²), or s² over the same for ``acceleration``."""
+
+    name, location = "actuator_dynamics", "actuator"
+    parameters = (
+        Parameter("actuator_dynamics.frequency_hz", "Hz", 5.0, 5e3, "positive"),
+        Parameter("actuator_dynamics.damping", "1", 0.005, 5.0, "positive"),
+    )
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        f = known.free_hz
+        return [(0.6 * f, 0.2), (0.85 * f, 0.15), (1.2 * f, 0.15), (2.0 * f, 0.3), (1.0 * f, 0.4)]
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        w = 2 * np.pi * p["actuator_dynamics.frequency_hz"]
+        top = w * w if self.form == "resonance" else s * s
+        return top / (s * s + 2.0 * p["actuator_dynamics.damping"] * w * s + w * w)
+
+
+class VoiceCoil(Effect):
+    """First-order lag of the voice coil, 1/(1 + sT)."""
+
+    name, location, form = "actuator_dynamics", "actuator", "pole"
+    parameters = (Parameter("actuator_dynamics.time_s", "s", 0.0, 0.1, scale=1e-4),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.03 / known.free_hz,), (0.3 / known.free_hz,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        return 1.0 / (s * p["actuator_dynamics.time_s"] + 1.0)
+
+
+class ActuatorDelay(Effect):
+    """A delay between the recorded drive and the sound.
+
+    A delay of both microphones against the drive is the same thing seen from the other side.
+    """
+
+    name, location, form = "actuator_dynamics", "actuator", "delay"
+    parameters = (Parameter("actuator_dynamics.delay_s", "s", -0.02, 0.05, scale=1e-4),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.03 / known.free_hz,), (0.2 / known.free_hz,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        return dual.exp(-(s * p["actuator_dynamics.delay_s"]))
+
+
+class Distortion(Effect):
+    """Polynomial distortion of the drive: u + α₂ u² + α₃ u³ (compression where α₃ < 0)."""
+
+    name, location = "actuator_nonlinearity", "actuator"
+
+    def __init__(self, powers: tuple[int, ...]) -> None:
+        self.powers = powers
+        words = {2: "quadratic", 3: "cubic", 5: "quintic"}
+        self.form = "_".join(words[d] for d in powers)
+        self.parameters = tuple(
+            Parameter(f"actuator_nonlinearity.a{d}", f"V^-{d - 1}") for d in powers
+        )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        u = known.drive_amplitude
+        return [tuple(-0.02 / u ** (d - 1) for d in self.powers)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,) * len(self.powers)
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        K = at.harmonics
+        wave = balance.to_time(u, K)
+        total = u
+        for d in self.powers:
+            harmonics = balance.to_harmonics(wave**d, K)
+            total = total + harmonics * p[f"actuator_nonlinearity.a{d}"]
+        return total
+
+
+class Clipping(Effect):
+    """The amplifier saturates: L tanh(u/L)."""
+
+    name, location, form = "actuator_nonlinearity", "actuator", "saturation"
+    parameters = (Parameter("actuator_nonlinearity.inverse_level", "1/V", 0.0),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.3 / known.drive_amplitude,), (1.0 / known.drive_amplitude,)]
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        K = at.harmonics
+        inverse = p["actuator_nonlinearity.inverse_level"]
+        wave = balance.to_time(u, K)
+        return balance.to_harmonics(dual.tanh(wave * inverse) / inverse, K)
+
+
+class HardClipping(Effect):
+    """The amplifier's rails: the drive is cut off at ± a level."""
+
+    name, location, form = "actuator_nonlinearity", "actuator", "clipping"
+    parameters = (Parameter("actuator_nonlinearity.level_v", "V", 1e-9, np.inf, "positive"),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(share * known.drive_amplitude,) for share in (0.25, 0.5, 0.7, 0.85, 0.96)]
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        forth, back = _finely(at.harmonics)
+        level = p["actuator_nonlinearity.level_v"]
+        wave = np.concatenate([u.real, u.imag], axis=1) @ forth
+        cut = np.clip(wave, -dual.value(level), dual.value(level))
+        # only the cut samples depend on the level; their harmonics are its derivative
+        moved = np.sign(wave) * (np.abs(wave) > dual.value(level))
+        return dual.chain(cut @ back, (moved @ back, level))
+
+
+class Knee(Effect):
+    """An amplifier near its rails: u / (1 + |u/L|ⁿ)^(1/n), linear below L, ± L above.
+
+    The order n is the knee's sharpness (Rapp's model of amplifiers; n → ∞ clips hard).
+    """
+
+    name, location, form = "actuator_nonlinearity", "actuator", "knee"
+    parameters = (
+        Parameter("actuator_nonlinearity.level_v", "V", 1e-9, np.inf, "positive"),
+        Parameter("actuator_nonlinearity.order", "1", 1.0, 60.0, "positive"),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        u = known.drive_amplitude
+        return [(share * u, n) for share in (0.35, 0.6, 0.9) for n in (3.0, 8.0)]
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        forth, back = _finely(at.harmonics)
+        L, n = p["actuator_nonlinearity.level_v"], p["actuator_nonlinearity.order"]
+        level, order = dual.value(L), dual.value(n)
+        wave = np.concatenate([u.real, u.imag], axis=1) @ forth
+        ratio = np.maximum(np.abs(wave) / level, 1e-12)
+        power = ratio**order
+        q = 1.0 + power
+        out = wave * q ** (-1.0 / order)
+        by_level = out * power / q / level
+        by_order = out * (np.log(q) / order**2 - power * np.log(ratio) / (order * q))
+        return dual.chain(out @ back, (by_level @ back, L), (by_order @ back, n))
+
+
+@lru_cache(maxsize=8)
+def _finely(harmonics: int) -> tuple[FloatArray, ComplexArray]:
+    """Matrices (2K, T) to and (T, K) from 2048 samples a period: corners alias below 1e-6."""
+    tau = 2 * np.pi * np.arange(2048) / 2048
+    angle = np.outer(np.arange(1, harmonics + 1), tau)
+    forth = np.vstack([np.cos(angle), -np.sin(angle)])
+    return forth, np.asarray((2.0 / tau.size) * np.exp(-1j * angle.T))
+
+
+EFFECTS: tuple[Effect, ...] = (
+    SpeakerResonance("resonance"),
+    SpeakerResonance("acceleration"),
+    VoiceCoil(),
+    ActuatorDelay(),
+    Distortion((2,)),
+    Distortion((3,)),
+    Distortion((2, 3)),
+    Distortion((3, 5)),
+    Clipping(),
+    HardClipping(),
+    Knee(),
+)

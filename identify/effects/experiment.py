@@ -1,0 +1,83 @@
+"""The experiment: parameters that change in the course of a campaign."""
+
+from dataclasses import replace
+from typing import Any
+
+from identify.parameters import Parameter
+from identify.structure import Conditions, Effect, Known, Mode, Values
+
+
+class Drift(Effect):
+    """A relative change over the campaign, linear in time (``_curve``: and quadratic).
+
+    ``frequency``: all modal frequencies together, as temperature does; ``flame_gain``: the fuel;
+    ``damping``; ``speaker_gain``: a warming voice coil; ``first_mode``: mode 1's frequency alone.
+    Time is 0 at the campaign's start, 1 at the start of its last run.
+    """
+
+    name, location = "parameter_drift", "experiment"
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+        self.what = form.removesuffix("_curve")
+        self.curved = form.endswith("_curve")
+        scale = 1e-3 if "frequency" in form or "mode" in form else 1e-2
+        names = ["relative_change"] + (["curvature"] if self.curved else [])
+        self.parameters = tuple(
+            Parameter(f"parameter_drift.{n}", "1", -0.8, 0.8, scale=scale) for n in names
+        )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        size = self.parameters[0].scale
+        rest = (0.0,) * (len(self.parameters) - 1)
+        return [(sign * q * size, *rest) for q in (1.0, 5.0, 20.0) for sign in (1.0, -1.0)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,) * len(self.parameters)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        t = at.time[:, None]
+        change: Any = p["parameter_drift.relative_change"] * t
+        if self.curved:
+            change = change + p["parameter_drift.curvature"] * (t * t - t)
+        factor = change + 1.0
+        if self.what == "frequency":
+            return [replace(m, frequency_hz=m.frequency_hz * factor) for m in modes]
+        if self.what == "first_mode":
+            return [replace(modes[0], frequency_hz=modes[0].frequency_hz * factor), *modes[1:]]
+        if self.what == "flame_gain":
+            return [replace(m, flame_residue=m.flame_residue * factor) for m in modes]
+        if self.what == "damping":
+            return [replace(m, damping=m.damping * factor) for m in modes]
+        return [replace(m, speaker_residue=m.speaker_residue * factor) for m in modes]
+
+
+class FlamePoleDrift(Effect):
+    """The flame's time scale changes over the campaign: an extra factor on the first pole."""
+
+    name, location, form = "parameter_drift", "experiment", "flame_pole"
+    parameters = (Parameter("parameter_drift.relative_change", "1", -0.8, 0.8, scale=1e-2),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.01,), (-0.01,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        pole = 2 * 3.141592653589793 * p["flame.pole_hz"]
+        moved = pole * (p["parameter_drift.relative_change"] * at.time[:, None] + 1.0)
+        # unit static gain is kept: ω/(s + ω) is what moves
+        return (s + pole) / (s + moved) * (moved / pole)
+
+
+EFFECTS: tuple[Effect, ...] = (
+    Drift("frequency"),
+    Drift("first_mode"),
+    Drift("flame_gain"),
+    Drift("damping"),
+    Drift("speaker_gain"),
+    Drift("frequency_curve"),
+    Drift("flame_gain_curve"),
+    FlamePoleDrift(),
+)

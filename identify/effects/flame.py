@@ -1,0 +1,106 @@
+"""Flame path: how the heat release may follow the velocity other than declared."""
+
+from typing import Any
+
+import numpy as np
+
+from identify import dual
+from identify.parameters import Parameter
+from identify.structure import Conditions, Effect, Known, Values
+
+
+class FlameDelay(Effect):
+    """Convective time delay of the flame's response, e^{−sτ} (n–τ model)."""
+
+    name, location = "flame_delay", "flame"
+    parameters = (Parameter("flame_delay.delay_s", "s", 0.0, 0.02, scale=1e-4),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        period = 1 / known.free_hz
+        return [(0.02 * period,), (0.08 * period,), (0.2 * period,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return dual.exp(-(s * p["flame_delay.delay_s"]))
+
+
+class ExtraPole(Effect):
+    """One more first-order lag, 1/(1 + sT)."""
+
+    name, location, form = "flame_dynamics", "flame", "pole"
+    parameters = (Parameter("flame_dynamics.time_s", "s", 0.0, 0.1, scale=1e-4),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        period = 1 / known.free_hz
+        return [(0.02 * period,), (0.1 * period,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return 1.0 / (s * p["flame_dynamics.time_s"] + 1.0)
+
+
+class SecondTimeScale(Effect):
+    """A second, parallel time scale: 1 − share + share/(1 + sT)."""
+
+    name, location, form = "flame_dynamics", "flame", "second_time_scale"
+    parameters = (
+        Parameter("flame_dynamics.share", "1", -2.0, 2.0),
+        Parameter("flame_dynamics.time_s", "s", 1e-6, 1.0, "positive"),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        period = 1 / known.free_hz
+        return [(0.1, 0.05 * period), (0.1, 0.5 * period)]
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        share, time = p["flame_dynamics.share"], p["flame_dynamics.time_s"]
+        return 1.0 - share + share / (s * time + 1.0)
+
+
+class FlameResonance(Effect):
+    """Second-order response of the flame, ω²/(s² + 2ζωs + ω²)."""
+
+    name, location, form = "flame_dynamics", "flame", "second_order"
+    parameters = (
+        Parameter("flame_dynamics.frequency_hz", "Hz", 5.0, 1e4, "positive"),
+        Parameter("flame_dynamics.damping", "1", 0.02, 10.0, "positive"),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(5 * known.free_hz, 0.7), (1.6 * known.free_hz, 0.5)]
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        w = 2 * np.pi * p["flame_dynamics.frequency_hz"]
+        return w * w / (s * s + 2.0 * p["flame_dynamics.damping"] * w * s + w * w)
+
+
+class DistributedDelay(Effect):
+    """A delay spread normally around its mean: exp(−sτ + s²σ²/2)."""
+
+    name, location, form = "flame_dynamics", "flame", "distributed_delay"
+    generalises = ("flame_delay",)
+    parameters = (
+        Parameter("flame_dynamics.delay_s", "s", 0.0, 0.02, scale=1e-4),
+        Parameter("flame_dynamics.spread_s", "s", 1e-7, 0.02, "positive"),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        period = 1 / known.free_hz
+        return [(0.1 * period, 0.05 * period)]
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        tau, sigma = p["flame_dynamics.delay_s"], p["flame_dynamics.spread_s"]
+        return dual.exp(s * s * (sigma * sigma) * 0.5 - s * tau)
+
+
+EFFECTS: tuple[Effect, ...] = (
+    FlameDelay(),
+    ExtraPole(),
+    SecondTimeScale(),
+    FlameResonance(),
+    DistributedDelay(),
+)

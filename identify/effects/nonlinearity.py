@@ -1,0 +1,175 @@
+"""Nonlinearity: another characteristic than the declared one."""
+
+from typing import Any
+
+import numba
+import numpy as np
+import numpy.typing as npt
+
+from identify import dual
+from identify.dual import Dual
+from identify.parameters import Parameter
+from identify.structure import Characteristic, Conditions, Effect, Known, Values
+
+Samples = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+class HigherOrder(Effect):
+    """Further powers of the flame's input, added to the declared polynomial."""
+
+    name, location = "nonlinearity_shape", "nonlinearity"
+
+    def __init__(self, powers: tuple[int, ...]) -> None:
+        self.powers = powers
+        words = {4: "quartic", 5: "quintic", 7: "septic"}
+        self.form = "_".join(words[d] for d in powers)
+        self.parameters = tuple(
+            Parameter(f"nonlinearity_shape.c{d}", f"m^-{d - 1}") for d in powers
+        )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        w = known.flame_input_amplitude
+        return [tuple(-0.02 / w ** (d - 1) for d in self.powers)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,) * len(self.powers)
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        coefficients = [p[f"nonlinearity_shape.c{d}"] for d in self.powers]
+
+        def more(w: Any) -> Any:
+            total = n(w)
+            for d, c in zip(self.powers, coefficients, strict=True):
+                total = total + w**d * c
+            return total
+
+        return more
+
+
+class Saturation(Effect):
+    """The flame's input saturates before the declared characteristic acts on it.
+
+    ``tanh``: L tanh(w/L); ``algebraic``: w/√(1 + (w/L)²).
+    """
+
+    name, location = "nonlinearity_shape", "nonlinearity"
+    parameters = (Parameter("nonlinearity_shape.inverse_level", "1/m", 0.0),)
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.3 / known.flame_input_amplitude,), (1.0 / known.flame_input_amplitude,)]
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        inverse = p["nonlinearity_shape.inverse_level"]
+        if self.form == "tanh":
+            return lambda w: n(dual.tanh(w * inverse) / inverse)
+        return lambda w: n(w / dual.sqrt((w * inverse) ** 2 + 1.0))
+
+
+class DeadZone(Effect):
+    """Nothing passes within ±`width`; beyond it, what exceeds it does."""
+
+    name, location, form = "nonlinearity_shape", "nonlinearity", "dead_zone"
+    parameters = (Parameter("nonlinearity_shape.width", "m", 0.0, np.inf, "positive"),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q * known.flame_input_amplitude,) for q in (0.005, 0.03, 0.15)]
+
+    def operator(self, p: Values) -> Characteristic:
+        width = p["nonlinearity_shape.width"]
+
+        def zone(w: Any) -> Any:
+            x = dual.value(w)
+            half = dual.value(width)
+            side = np.where(np.abs(x) > half, np.sign(x), 0.0)
+            return dual.chain(side * (np.abs(x) - half), (np.abs(side), w), (-side, width))
+
+        return zone
+
+
+class SoftDeadZone(Effect):
+    """Small motions pass with a lower gain: w − share · L tanh(w/L)."""
+
+    name, location, form = "nonlinearity_shape", "nonlinearity", "soft_dead_zone"
+    parameters = (
+        Parameter("nonlinearity_shape.share", "1", -3.0, 3.0),
+        Parameter("nonlinearity_shape.level", "m", 1e-12, 1e12, "positive"),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        w = known.flame_input_amplitude
+        return [(0.1, 0.2 * w), (0.1, 0.5 * w)]
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        share, level = p["nonlinearity_shape.share"], p["nonlinearity_shape.level"]
+        return lambda w: n(w) - dual.tanh(w / level) * (level * share)
+
+
+class Hysteresis(Effect):
+    """Backlash: the characteristic's argument follows the flame's input a half-width behind.
+
+    The play operator: an output y stays where it is while |y − w| ≤ `width`, and is carried along
+    at that distance otherwise.
+    """
+
+    name, location, form = "nonlinearity_shape", "nonlinearity", "hysteresis"
+    parameters = (Parameter("nonlinearity_shape.width", "m", 0.0, np.inf, "positive"),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q * known.flame_input_amplitude,) for q in (0.002, 0.02, 0.1)]
+
+    def operator(self, p: Values) -> Characteristic:
+        width = p["nonlinearity_shape.width"]
+
+        def play(w: Any) -> Any:
+            x = np.ascontiguousarray(dual.value(w))
+            half = np.ascontiguousarray(
+                np.broadcast_to(dual.value(width), (x.shape[0], 1))[:, 0], dtype=np.float64
+            )
+            at, side = _contacts(x, half)
+            row = np.arange(x.shape[0])[:, None]
+            y = x[row, at] + side * half[:, None]
+            # what was touched last is remembered: value and derivative of that moment
+            touched = None if not isinstance(w, Dual) else Dual(x[row, at], w.d[row, at])
+            one = np.ones_like(y)
+            return dual.chain(y, (one, touched), (side, width))
+
+        return play
+
+
+@numba.njit(cache=True)  # type: ignore[untyped-decorator]
+def _contacts(x: Samples, half: Samples) -> tuple[Indices, Samples]:
+    """When the play last touched, and on which side (−1 below, +1 above): both (runs, samples).
+
+    Two periods, of which the first finds the state; a motion within the play touches nowhere and
+    is taken as touching at its first sample.
+    """
+    at = np.zeros(x.shape, dtype=np.int64)
+    side = np.zeros(x.shape)
+    for r in range(x.shape[0]):
+        y, last, sign = x[r, 0], 0, 0.0
+        for lap in range(2):
+            for i in range(x.shape[1]):
+                if y < x[r, i] - half[r]:
+                    y, last, sign = x[r, i] - half[r], i, -1.0
+                elif y > x[r, i] + half[r]:
+                    y, last, sign = x[r, i] + half[r], i, 1.0
+                if lap == 1:
+                    at[r, i] = last
+                    side[r, i] = sign
+    return at, side
+
+
+EFFECTS: tuple[Effect, ...] = (
+    HigherOrder((4,)),
+    HigherOrder((5,)),
+    HigherOrder((4, 5)),
+    Saturation("tanh"),
+    Saturation("algebraic"),
+    DeadZone(),
+    SoftDeadZone(),
+    Hysteresis(),
+)

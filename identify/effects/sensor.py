@@ -1,0 +1,186 @@
+"""Sensors: how the two-microphone velocity may differ from the velocity at the flame.
+
+The measured pressures themselves say what a mismatch or an offset does: the correction is formed
+from them and added to the prediction, so that it needs no model of the pressure field.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from identify import dual
+from identify.parameters import Parameter
+from identify.structure import Conditions, Effect, Known, Mode, Values
+
+
+def _upper_pressure(at: Conditions, s: Any) -> Any:
+    """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
+    return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m) * at.velocity
+
+
+def _add(at: Conditions, y: Any, leak: Any) -> Any:
+    """Prediction plus a leak formed from measured signals, in the measurement's phase.
+
+    A free run's orbit has a phase of its own: it is turned first, so that its fundamental stands
+    where the measured one stands without the leak.
+    """
+    if not at.free:
+        return y + leak
+    target = (at.velocity - leak)[:, :1]
+    z = target * dual.conj(y[:, :1])
+    unit = z / dual.sqrt((z * dual.conj(z)).real)
+    return y * dual.powers(unit, at.harmonics) + leak
+
+
+class ChannelMismatch(Effect):
+    """The upper microphone reads g times the pressure: gain, sampling time, phase or a low-pass.
+
+    û_measured − û_true = −p̂₂ (1 − 1/g) / (ρ Δx s): common pressure leaks into the velocity.
+    """
+
+    name, location = "channel_mismatch", "sensor"
+    needs = ("pressure",)
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+        gain = Parameter("channel_mismatch.gain", "1", -0.5, 0.5, scale=1e-3)
+        skew = Parameter("channel_mismatch.skew_s", "s", -1e-2, 1e-2, scale=1e-6)
+        phase = Parameter("channel_mismatch.phase_rad", "rad", -1.0, 1.0, scale=1e-3)
+        lag = Parameter("channel_mismatch.lowpass_time_s", "s", -1e-2, 1e-2, scale=1e-6)
+        self.parameters = {
+            "gain": (gain,),
+            "skew": (skew,),
+            "gain_skew": (gain, skew),
+            "phase": (phase,),
+            "gain_phase": (gain, phase),
+            "lowpass": (lag,),
+        }[form]
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [tuple(p.scale for p in self.parameters)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,) * len(self.parameters)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        inverse: Any = 1.0
+        for q in self.parameters:
+            value = p[q.name]
+            if q.name.endswith("gain"):
+                inverse = inverse / (value + 1.0)
+            elif q.name.endswith("skew_s"):
+                inverse = inverse * dual.exp(s * value)
+            elif q.name.endswith("phase_rad"):
+                inverse = inverse * dual.exp(1j * value)
+            else:
+                inverse = inverse * (s * value + 1.0)
+        leak = _upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m))
+        return _add(at, y, leak * (inverse - 1.0))
+
+
+class SensorOffset(Effect):
+    """The velocity is taken a distance away from the flame.
+
+    ``propagation`` carries it over a lossless duct with the measured pressure,
+    u(x + δ) = u(x) cos kδ − j p(x) sin kδ / (ρc); ``mode_shapes`` takes each declared mode's own
+    shape, ∝ sin(k_i x), at the flame and at the sensor.
+    """
+
+    name, location = "sensor_offset", "sensor"
+    parameters = (Parameter("sensor_offset.distance_m", "m", -0.5, 0.5, scale=1e-2),)
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+        self.needs = ("pressure",) if form == "propagation" else ()
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.01,), (-0.01,), (0.08,), (-0.08,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        if self.form != "mode_shapes":
+            return modes
+        distance = p["sensor_offset.distance_m"]
+        out = []
+        for m in modes:
+            k = 2 * np.pi * m.frequency_hz / at.sound_speed_m_s
+            x = at.centre_m
+            ratio = dual.sin(k * x) / dual.sin(k * (x - distance))
+            out.append(Mode(m.frequency_hz, m.damping, m.flame_residue, m.speaker_residue, ratio))
+        return out
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        if self.form != "propagation":
+            return y
+        # sensor at x, flame at x − δ:  u_flame = u cos kδ + j p sin kδ/(ρc), so that
+        # u = (u_flame − j p sin kδ/(ρc)) / cos kδ with the pressure measured at the sensor
+        angle = (-1j * s) * p["sensor_offset.distance_m"] * (1.0 / at.sound_speed_m_s)
+        impedance = at.density_kg_m3 * at.sound_speed_m_s
+        leak = dual.sin(angle) * (1j / impedance * at.pressure)
+        cosine = dual.cos(angle)
+        return _add(at, y / cosine, -(leak / cosine))
+
+
+class ModalOffset(Effect):
+    """The velocity is taken away from the flame, in modes of unknown shape.
+
+    Each mode's velocity at the sensor over that at the flame, relative to mode 1's: a ratio common
+    to all modes only changes the scale of the velocity and cannot be seen.
+    """
+
+    name, location, empirical = "sensor_offset", "sensor", True
+
+    def __init__(self, modes: int) -> None:
+        self.form = f"modal_{modes}"
+        self.mode_count = modes
+        self.parameters = tuple(
+            Parameter(f"sensor_offset.ratio{i}", "1", -5.0, 5.0, scale=1e-2)
+            for i in range(2, modes + 1)
+        )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q,) * len(self.parameters) for q in (0.98, 1.02, 0.85, 1.15)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (1.0,) * len(self.parameters)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        ratios = [1.0, *(p[q.name] for q in self.parameters)]
+        pairs = zip(modes, ratios, strict=False)  # an added mode is measured as it is
+        seen = [replace(m, sensor_ratio=ratio) for m, ratio in pairs]
+        return [*seen, *modes[len(seen) :]]
+
+
+class SensorLag(Effect):
+    """Both microphones share a first-order low-pass, 1/(1 + sT)."""
+
+    name, location, form = "sensor_dynamics", "sensor", "lowpass"
+    parameters = (Parameter("sensor_dynamics.time_s", "s", 0.0, 0.1, scale=1e-4),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.03 / known.free_hz,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        return y / (s * p["sensor_dynamics.time_s"] + 1.0)
+
+
+EFFECTS: tuple[Effect, ...] = (
+    ChannelMismatch("gain"),
+    ChannelMismatch("skew"),
+    ChannelMismatch("gain_skew"),
+    ChannelMismatch("phase"),
+    ChannelMismatch("gain_phase"),
+    ChannelMismatch("lowpass"),
+    SensorOffset("propagation"),
+    SensorOffset("mode_shapes"),
+    ModalOffset(2),
+    ModalOffset(3),
+    ModalOffset(4),
+    SensorLag(),
+)

@@ -1,0 +1,529 @@
+"""Maximum likelihood on the solved orbit.
+
+Each run's Fourier coefficients are predicted by solving the harmonic balance, and the parameters
+minimise the noise-weighted difference to the measured ones:
+
+    χ²(θ) = Σ_runs |W (Y − Ŷ(θ))|²
+
+by Levenberg–Marquardt with the exact Jacobian of `identify.balance`. For Gaussian noise this is
+the maximum-likelihood estimate; (JᵀJ)⁻¹ is its covariance and, at the truth, the Cramér–Rao bound.
+
+The measured branch is followed: the inner solver starts from the last accepted orbit, else from
+the measurement; a step on which it fails is refused and shortened. `softening` adds a share of
+each coefficient's own size to its noise: far from the optimum, where the balance is stiff, it lets
+all runs pull evenly; lowered step by step to zero, it leads the fit in (continuation).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import balance
+from identify.balance import Orbits
+from identify.dataset import Batch, Dataset, whitener
+from identify.parameters import Estimate
+from identify.structure import Structure
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
+
+LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The outcome of a fit: an answer only where `converged`; `reason` says why not.
+
+    `theta` are the internal unknowns; `covariance` (p, p) theirs; `residual` the whitened
+    residuals in the order of the batches; `jacobian` theirs.
+    """
+
+    structure: Structure
+    theta: FloatArray
+    chi2: float
+    dof: int
+    covariance: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+    converged: bool
+    reason: str
+    iterations: int
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.chi2 / max(self.dof, 1)
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        return self.structure.parameters.estimates(self.theta, self.covariance)
+
+    @property
+    def values(self) -> dict[str, float]:
+        return self.structure.parameters.plain(self.theta)
+
+
+def soften(batches: Sequence[Batch], share: float) -> tuple[Batch, ...]:
+    """Batches whose noise is raised by `share` of each coefficient's size."""
+    if share == 0:
+        return tuple(batches)
+    out = []
+    for b in batches:
+        size = np.abs(b.measured)
+        # no coefficient counts for less than a hundredth of its run's fundamental
+        size = np.maximum(size, 0.01 * size[:, :1])
+        extra = np.concatenate([size, size], axis=1) * share
+        if b.free:
+            extra[:, b.compared] = share * b.at.omega / (2 * np.pi) * 0.1
+        covariance = b.covariance + extra[:, :, None] ** 2 * np.eye(2 * b.compared)
+        out.append(
+            replace(b, covariance=covariance, whitener=np.stack([whitener(c) for c in covariance]))
+        )
+    return tuple(out)
+
+
+def compare(batch: Batch, orbits: Orbits) -> tuple[FloatArray, FloatArray | None]:
+    """Whitened residuals (runs·2K,) of one batch and their Jacobian (runs·2K, p)."""
+    K = batch.compared
+    y = orbits.velocity[:, :K]
+    dy = None if orbits.d_velocity is None else orbits.d_velocity[:, :K]
+    if batch.free:
+        y, dy, measured = _turned(batch, y, dy)
+    else:
+        measured = batch.measured
+    error = measured - y
+    real = np.concatenate([error.real, error.imag], axis=1)
+    d_real = None if dy is None else -np.concatenate([dy.real, dy.imag], axis=1)
+    if batch.free:
+        real[:, K] = (batch.at.omega - orbits.omega) / (2 * np.pi)
+        if d_real is not None and orbits.d_omega is not None:
+            d_real[:, K] = -orbits.d_omega / (2 * np.pi)
+    rho = np.einsum("rij,rj->ri", batch.whitener, real).ravel()
+    if d_real is None:
+        return rho, None
+    return rho, (batch.whitener @ d_real).reshape(rho.size, -1)
+
+
+def _turned(
+    batch: Batch, y: ComplexArray, dy: ComplexArray | None
+) -> tuple[ComplexArray, ComplexArray | None, ComplexArray]:
+    """Prediction and measurement of free runs, both turned so that the fundamental is real."""
+    k = np.arange(1, batch.compared + 1)
+    phase = np.angle(y[:, :1])
+    turned = y * np.exp(-1j * phase * k)
+    if dy is not None:
+        d_phase = (dy[:, :1] / y[:, :1, None]).imag
+        dy = (dy - 1j * k[:, None] * d_phase * y[..., None]) * np.exp(-1j * phase * k)[..., None]
+    measured = batch.measured * np.exp(-1j * np.angle(batch.measured[:, :1]) * k)
+    return turned, dy, measured
+
+
+@dataclass
+class Evaluated:
+    """Residuals (vectors, n) of several parameter vectors, their Jacobians (vectors, n, p) where
+    asked for, and which of them exist (vectors,)."""
+
+    residual: FloatArray
+    jacobian: FloatArray | None
+    exists: BoolArray
+
+
+class Residual(Protocol):
+    """θ → whitened residuals, for several vectors at once.
+
+    `which` says which of the descents each vector belongs to, for whatever is remembered.
+    """
+
+    def __call__(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated: ...
+
+
+class OrbitResidual:
+    """Whitened residuals of solved orbits, with the last orbits to start the next ones from.
+
+    With `newton_steps` the orbits are only approached by that many steps from the measurement:
+    the residual then exists for nearly every θ and has fewer local minima, close to a solution it
+    is the same. (The plain equation error with the measured velocity fed to the nonlinearity has
+    no such use: a loop gain of one explains any measurement by itself.)
+    """
+
+    def __init__(
+        self, structure: Structure, batches: Sequence[Batch], newton_steps: int | None = None
+    ) -> None:
+        self.structure = structure
+        self.batches = tuple(batches)
+        self.newton_steps = newton_steps
+        self.known: dict[int, tuple[FloatArray, list[Orbits]]] = {}
+        self.solved: tuple[FloatArray, list[Orbits]] | None = None
+
+    def __call__(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated:
+        vectors = thetas.shape[0]
+        exists = np.ones(vectors, dtype=bool)
+        rows, jacobians, found = [], [], []
+        for i, batch in enumerate(self.batches):
+            with np.errstate(all="ignore"):
+                orbits = self._orbits(thetas, which, i, jacobian)
+                rho, J = compare(batch.tile(vectors), orbits)
+            if self.newton_steps is None:
+                exists &= orbits.converged.reshape(vectors, batch.runs).all(axis=1)
+            rows.append(rho.reshape(vectors, -1))
+            if J is not None:
+                jacobians.append(J.reshape(vectors, -1, J.shape[-1]))
+            found.append(orbits)
+        residual = np.concatenate(rows, axis=1)
+        exists &= np.isfinite(residual).all(axis=1)
+        if not jacobian:
+            self.solved = thetas.copy(), found
+            return Evaluated(residual, None, exists)
+        J_all = np.concatenate(jacobians, axis=1)
+        exists &= np.isfinite(J_all).all(axis=(1, 2))
+        if self.newton_steps is None:
+            self._remember(thetas, which, found, exists)
+        return Evaluated(residual, J_all, exists)
+
+    def _orbits(self, thetas: FloatArray, which: IntArray, i: int, jacobian: bool) -> Orbits:
+        """Batch i's orbits; those that the last trial solved already are only differentiated."""
+        batch = self.batches[i]
+        if jacobian and self.solved is not None:
+            same = [np.flatnonzero((self.solved[0] == t).all(axis=1)) for t in thetas]
+            if all(s.size for s in same):
+                runs = np.arange(batch.runs)
+                rows = np.concatenate([int(s[0]) * batch.runs + runs for s in same])
+                orbits = self.solved[1][i].take(rows)
+                return balance.differentiate(
+                    self.structure, thetas, batch.at, orbits, free=batch.free
+                )
+        start, start_omega = self._predict(thetas, which, i)
+        return balance.solve(
+            self.structure,
+            thetas,
+            batch.at,
+            free=batch.free,
+            start=start,
+            start_omega=start_omega,
+            derivatives=jacobian,
+            iterations=self.newton_steps or balance.MAX_ITERATIONS,
+        )
+
+    def _remember(
+        self, thetas: FloatArray, which: IntArray, found: Sequence[Orbits], exists: BoolArray
+    ) -> None:
+        for n, descent in enumerate(which):
+            if exists[n]:
+                parts = [
+                    o.take(np.arange(n * b.runs, (n + 1) * b.runs))
+                    for o, b in zip(found, self.batches, strict=True)
+                ]
+                self.known[int(descent)] = thetas[n].copy(), parts
+
+    def _predict(
+        self, thetas: FloatArray, which: IntArray, i: int
+    ) -> tuple[ComplexArray | None, FloatArray | None]:
+        """Where batch i's orbits are expected: the last ones, carried along their derivatives."""
+        if any(int(n) not in self.known for n in which):
+            return None, None
+        inputs, omegas = [], []
+        for theta, n in zip(thetas, which, strict=True):
+            before, orbits = self.known[int(n)][0], self.known[int(n)][1][i]
+            assert orbits.d_inputs is not None
+            step = theta - before
+            inputs.append(orbits.inputs + orbits.d_inputs @ step)
+            drift = 0.0 if orbits.d_omega is None else orbits.d_omega @ step
+            omegas.append(orbits.omega + drift)
+        return np.concatenate(inputs, axis=1), np.concatenate(omegas)
+
+
+class Straightened:
+    """The same residual in unknowns u in which its long valley is straight.
+
+    Near the limit cycle a gain of the flame is balanced by damping and detuning of the mode that
+    sings: 2ζ₁ω₁ and ω₁² move in proportion to r₁, while the products r₁ c_d and the ratios
+    r_i/r₁ stay. So u holds ζ₁ itself (not its logarithm), κ_i = r_i/r₁ and ρ_d = c_d r₁ in place
+    of ln ζ₁, r_i and c_d; along such a valley only r₁, ζ₁ and f₁ change, and linearly.
+    """
+
+    def __init__(self, inner: Residual, structure: Structure) -> None:
+        self.inner = inner
+        names = structure.parameters.names
+        self.r1 = names.index("mode1.flame_residue")
+        self.zeta = names.index("mode1.damping")
+        later = [n for n in names if n.endswith("flame_residue") and n != names[self.r1]]
+        self.ratios = np.array([names.index(n) for n in later], dtype=int)
+        kept = [i for i, n in enumerate(names) if n.startswith("nonlinearity.c")]
+        self.products = np.array(kept, dtype=int)
+
+    def inside(self, thetas: FloatArray) -> FloatArray:
+        u = thetas.copy()
+        r = self._safe(thetas[..., self.r1])
+        u[..., self.zeta] = np.exp(thetas[..., self.zeta])
+        u[..., self.ratios] = thetas[..., self.ratios] / r[..., None]
+        u[..., self.products] = thetas[..., self.products] * r[..., None]
+        return u
+
+    def outside(self, u: FloatArray) -> FloatArray:
+        thetas = u.copy()
+        r = self._safe(u[..., self.r1])
+        thetas[..., self.zeta] = np.log(np.maximum(u[..., self.zeta], 1e-12))
+        thetas[..., self.ratios] = u[..., self.ratios] * r[..., None]
+        thetas[..., self.products] = u[..., self.products] / r[..., None]
+        return thetas
+
+    @staticmethod
+    def _safe(r: FloatArray) -> FloatArray:
+        return np.asarray(np.where(np.abs(r) > 1e-12, r, 1e-12))
+
+    def to_inside(self, jacobian: FloatArray, u: FloatArray) -> FloatArray:
+        """∂ρ/∂u from ∂ρ/∂θ, (vectors, n, p)."""
+        J = jacobian.copy()
+        r = self._safe(u[:, self.r1])[:, None, None]
+        kappa, rho = u[:, None, self.ratios], u[:, None, self.products]
+        J[..., self.r1] += np.sum(jacobian[..., self.ratios] * kappa, axis=2)
+        J[..., self.r1] -= np.sum(jacobian[..., self.products] * rho / r**2, axis=2)
+        J[..., self.ratios] = jacobian[..., self.ratios] * r
+        J[..., self.products] = jacobian[..., self.products] / r
+        J[..., self.zeta] = jacobian[..., self.zeta] / np.maximum(u[:, self.zeta], 1e-12)[:, None]
+        return J
+
+    def to_outside(self, jacobian: FloatArray, u: FloatArray) -> FloatArray:
+        """∂ρ/∂θ from ∂ρ/∂u: the inverse of `to_inside`."""
+        J = jacobian.copy()
+        r = self._safe(u[:, self.r1])[:, None, None]
+        kappa, rho = u[:, None, self.ratios], u[:, None, self.products]
+        J[..., self.ratios] = jacobian[..., self.ratios] / r
+        J[..., self.products] = jacobian[..., self.products] * r
+        J[..., self.zeta] = jacobian[..., self.zeta] * np.maximum(u[:, self.zeta], 1e-12)[:, None]
+        J[..., self.r1] -= np.sum(J[..., self.ratios] * kappa, axis=2)
+        J[..., self.r1] += np.sum(J[..., self.products] * rho / r**2, axis=2)
+        return J
+
+    def __call__(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated:
+        found = self.inner(self.outside(thetas), which, jacobian)
+        if found.jacobian is not None:
+            found.jacobian = self.to_inside(found.jacobian, thetas)
+        return found
+
+    def bounds(self, structure: Structure) -> tuple[FloatArray, FloatArray]:
+        low, high = structure.parameters.bounds()
+        low, high = low.copy(), high.copy()
+        low[self.zeta], high[self.zeta] = np.exp(low[self.zeta]), np.exp(high[self.zeta])
+        return low, high
+
+
+@dataclass(frozen=True)
+class Descent:
+    """Where Levenberg–Marquardt ended."""
+
+    theta: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+    converged: bool
+    reason: str
+    iterations: int
+
+    @property
+    def cost(self) -> float:
+        return float(self.residual @ self.residual)
+
+
+@dataclass
+class _State:
+    """One descent in progress."""
+
+    theta: FloatArray
+    residual: FloatArray
+    jacobian: FloatArray
+    scale: FloatArray
+    damping: float
+    grow: float = 2.0
+    refused: int = 0
+    iterations: int = 0
+    promise: float = np.inf  # decrease of χ² that a Gauss–Newton step would bring
+    ended: str | None = None
+    converged: bool = False
+
+    @property
+    def cost(self) -> float:
+        return float(self.residual @ self.residual)
+
+
+def levenberg_marquardt(
+    function: Residual,
+    thetas: FloatArray,
+    *,
+    iterations: int = 60,
+    tolerance: float = 1e-6,
+    damping: float = 1e-3,
+    bounds: tuple[FloatArray, FloatArray] | None = None,
+) -> list[Descent | None]:
+    """Minimise |ρ(θ)|² from each of `thetas`, (starts, p), side by side.
+
+    A descent is None where the residual does not exist at its start. Converged means that the
+    step still to come would lower χ² by less than `tolerance` (absolute and relative): a hundredth
+    of what a thousandth of a standard error is worth. Unknowns are scaled by the Jacobian's
+    columns (Marquardt), damping follows the gain ratio (Nielsen). Unknowns at a bound that the
+    gradient pushes against are held there; `bounds` are (p,) each, or (starts, p).
+    """
+    count, p = thetas.shape
+    limits = bounds if bounds is not None else (np.full(p, -np.inf), np.full(p, np.inf))
+    low, high = (np.broadcast_to(limit, (count, p)) for limit in limits)
+    everyone = np.arange(count)
+    begin = np.clip(thetas, low, high)
+    first = function(begin, everyone, True)
+    assert first.jacobian is not None
+    states: list[_State | None] = [
+        _State(begin[n], first.residual[n], first.jacobian[n], np.zeros(p), damping)
+        if first.exists[n]
+        else None
+        for n in everyone
+    ]  # fmt: skip
+    while True:
+        active = [(n, s) for n, s in enumerate(states) if s is not None and s.ended is None]
+        trials, steps = [], []
+        for n, s in active:
+            step = _propose(s, low[n], high[n], tolerance, iterations)
+            if step is not None:
+                trials.append((n, s))
+                steps.append(step)
+        if not trials:
+            break
+        moved = np.stack([trial for trial, _ in steps])
+        which = np.array([n for n, _ in trials])
+        outcome = function(moved, which, False)
+        accepted = []
+        for m, ((_, s), (_, predicted)) in enumerate(zip(trials, steps, strict=True)):
+            new = float(outcome.residual[m] @ outcome.residual[m]) if outcome.exists[m] else np.inf
+            gain = (s.cost - new) / max(predicted, 1e-300)
+            if gain > 1e-4:
+                accepted.append(m)
+                s.damping = max(s.damping * max(1 / 5, 1 - (2 * min(gain, 1.0) - 1) ** 3), 1e-12)
+                s.grow, s.refused = 2.0, 0
+            else:
+                s.damping *= s.grow
+                s.grow *= 2.0
+                s.refused += 1
+        if accepted:
+            full = function(moved[accepted], which[accepted], True)
+            assert full.jacobian is not None
+            for row, m in enumerate(accepted):
+                s = trials[m][1]
+                if not full.exists[row]:
+                    s.ended = "the balance has no solution ahead"
+                    continue
+                s.theta, s.residual = moved[m], full.residual[row]
+                s.jacobian = full.jacobian[row]
+    return [
+        None
+        if s is None
+        else Descent(
+            s.theta, s.residual, s.jacobian, s.converged, s.ended or "stopped", s.iterations
+        )
+        for s in states
+    ]
+
+
+def _propose(
+    s: _State, low: FloatArray, high: FloatArray, tolerance: float, iterations: int
+) -> tuple[FloatArray, float] | None:
+    """The next trial of a descent and its predicted decrease, or None where it has ended."""
+    if s.refused == 0:
+        s.iterations += 1
+    norm = np.sqrt(np.sum(s.jacobian * s.jacobian, axis=0))
+    s.scale = np.maximum(s.scale, np.where(norm > 0, norm, 1e-100))
+    scale = np.where(s.scale > 1e-100, s.scale, 1.0)
+    J = s.jacobian / scale
+    g = J.T @ s.residual
+    held = ((s.theta <= low) & (g > 0)) | ((s.theta >= high) & (g < 0))
+    J, g = np.where(held, 0.0, J), np.where(held, 0.0, g)
+    U, sv, Vt = np.linalg.svd(J, full_matrices=False)
+    Ur = U.T @ s.residual
+    s.promise = float(np.sum(Ur**2 * (sv > 1e-9 * sv[0])))
+    enough = 1.0 + 1e-3 * s.cost
+    if s.promise < tolerance * enough:
+        s.converged, s.ended = True, "converged"
+        return None
+    if s.refused > 12:
+        s.converged = s.promise < 1e-3 * enough
+        s.ended = "converged" if s.converged else "no step lowers the misfit any further"
+        return None
+    if s.iterations > iterations:
+        s.ended = f"not converged in {iterations} iterations"
+        return None
+    step = -(Vt.T @ (sv / (sv**2 + s.damping) * Ur))
+    predicted = -float(step @ (2 * g + J.T @ (J @ step)))
+    return np.clip(s.theta + step / scale, low, high), predicted
+
+
+def covariance_of(jacobian: FloatArray) -> FloatArray:
+    """(JᵀJ)⁻¹ by SVD with scaled columns; undetermined directions get a very large variance."""
+    norm = np.sqrt(np.sum(jacobian**2, axis=0))
+    norm = np.where(norm > 1e-100, norm, 1e-100)
+    _, sv, Vt = np.linalg.svd(jacobian / norm, full_matrices=False)
+    inverse = 1.0 / np.maximum(sv, 1e-13 * max(float(sv[0]), 1e-300)) ** 2
+    return np.asarray(((Vt.T * inverse) @ Vt) / np.outer(norm, norm))
+
+
+def fit_orbits(
+    structure: Structure,
+    data: Dataset,
+    thetas: FloatArray,
+    *,
+    continuation: Sequence[float] = (0.03, 0.003, 0.0),
+    iterations: int = 60,
+) -> Fit:
+    """Maximum-likelihood fit from one start (p,) or several (starts, p); the best one is returned.
+
+    Each is led in by decreasing `continuation` shares, the last of which must be 0.
+    """
+    current = np.atleast_2d(thetas)
+    reason = "the harmonic balance has no solution at the start"
+    best: Descent | None = None
+    for share in continuation:
+        last = share == 0
+        residual = OrbitResidual(
+            structure, soften(data.fit, share), None if last else LEAD_IN_STEPS
+        )
+        straight = Straightened(residual, structure)
+        descents = levenberg_marquardt(
+            straight,
+            straight.inside(current),
+            iterations=iterations if last else 20,
+            tolerance=1e-6 if last else 1e-2,
+            bounds=straight.bounds(structure),
+        )
+        if last:
+            usable = [d for d in descents if d is not None]
+            best = min(usable, key=lambda d: (not d.converged, d.cost), default=None)
+        else:
+            pairs = zip(current, descents, strict=True)
+            current = np.stack([c if d is None else straight.outside(d.theta) for c, d in pairs])
+    if best is None:
+        return failed(structure, data, current[0], reason)
+    dof = best.residual.size - best.theta.size
+    theta = straight.outside(best.theta)
+    # the covariance is formed where the unknowns are well scaled, and carried over
+    jacobian = straight.to_outside(best.jacobian[None], best.theta[None])[0]
+    return Fit(
+        structure,
+        theta,
+        best.cost,
+        dof,
+        covariance_of(jacobian),
+        best.residual,
+        jacobian,
+        best.converged,
+        best.reason,
+        best.iterations,
+    )
+
+
+def failed(structure: Structure, data: Dataset, theta: FloatArray, reason: str) -> Fit:
+    """The outcome of a fit that produced nothing to rely on."""
+    n, p = data.residuals, theta.size
+    nothing = np.full((p, p), np.inf)
+    return Fit(
+        structure, theta, np.inf, n - p, nothing, np.full(n, np.inf), np.zeros((n, p)), False,
+        reason, 0,
+    )  # fmt: skip

@@ -1,0 +1,204 @@
+"""`identify`: a campaign in, the declared model's fit out, with everything needed to judge it.
+
+Recordings → quality gate → Fourier coefficients with covariance → starts from the data →
+maximum likelihood on the solved orbit → errors, uncertainties, the model's own limit cycle.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import assess, dataset, drive, harmonics, profile, quality, start
+from identify.dataset import Dataset
+from identify.executor import InProcess
+from identify.fit import Fit, failed
+from identify.harmonics import Harmonics
+from identify.record import Campaign, DeclaredModel
+from identify.results import Identification
+from identify.structure import NONLINEARITIES, Structure
+from identify.trace import GROSS, try_effects
+
+FloatArray = npt.NDArray[np.float64]
+Progress = Callable[[float, str], None]
+
+DOUBT = 10.0  # times its noise that a run flagged as down-weighted is taken to err
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A campaign ready to be fitted: its quality, measured harmonics and batches."""
+
+    campaign: Campaign
+    structure: Structure
+    quality: quality.Quality
+    measured: tuple[Harmonics, ...]
+    data: Dataset
+
+
+def declared_structure(model: DeclaredModel) -> Structure:
+    """The structure that the experimenter believes.
+
+    Raises
+    ------
+    ValueError : a word of the declared model is not known; the message lists those that are.
+    """
+    flames = {"first_order_lowpass": 1, "second_order_lowpass": 2, "none": 0}
+    delayed = model.flame.endswith("_delay")
+    flame = model.flame.removesuffix("_delay").removesuffix("_with")
+    if flame not in flames:
+        raise ValueError(
+            f"declared_model.flame={model.flame!r} is not one of {sorted(flames)}, "
+            "with or without '_with_delay'"
+        )
+    if model.nonlinearity not in NONLINEARITIES:
+        raise ValueError(
+            f"declared_model.nonlinearity={model.nonlinearity!r} is not in {NONLINEARITIES}"
+        )
+    return Structure(
+        mode_count=model.modes,
+        flame_order=int(model.options.get("flame_order", flames[flame])),
+        flame_delay=delayed,
+        nonlinearity=model.nonlinearity,
+        degree=model.nonlinearity_degree,
+        nodes=tuple(float(x) for x in model.options.get("nodes", ())),
+    )
+
+
+def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
+    """Quality gate and Fourier coefficients of a campaign.
+
+    Raises
+    ------
+    identify.harmonics.RecordError : a recording cannot be used; names run, channel and reason.
+    ValueError : no usable forced run, or a declared model that is not known.
+    """
+    chosen = structure or declared_structure(campaign.declared_model)
+    found = quality.inspect(campaign)
+    measured = [
+        h.doubted(DOUBT) if h.name in found.doubted else h
+        for h in harmonics.measure_campaign(campaign, skip=sorted(found.excluded))
+    ]
+    if not any(h.kind == "forced" and h.role == "fit" for h in measured):
+        reasons = "; ".join(f"{f.run}: {f.flag}" for f in found.flags if f.run in found.excluded)
+        raise ValueError(
+            f"campaign {campaign.title!r} has no usable forced run to fit on"
+            + (f" (excluded: {reasons})" if reasons else "; record at least one")
+        )
+    mics = harmonics.microphones(campaign.runs[0])
+    data = dataset.build(measured, campaign.medium, mics)
+    return Prepared(campaign, chosen, found, tuple(measured), data)
+
+
+def identify(
+    campaign: Campaign,
+    *,
+    structure: Structure | None = None,
+    progress: Progress | None = None,
+) -> Identification:
+    """Fit the declared model (or `structure`) to a campaign.
+
+    A fit that does not converge says so in `assessment.fit.converged` and `.reason`; its
+    parameters are then no answer. Raises what `prepare` raises.
+    """
+    began = time.perf_counter()
+    report = progress or (lambda share, text: None)
+    report(0.0, "measuring harmonics")
+    ready = prepare(campaign, structure)
+    report(0.2, "fitting the declared model")
+    data, fit = drive.refitted(fit_structure(ready.structure, ready.data), ready.data)
+    report(0.9, "validating")
+    assessment = assess.assess(fit, data)
+    report(0.95, "intervals")
+    bounds = profile.intervals(fit, data)
+    report(1.0, "done")
+    return Identification(
+        campaign=campaign.identifier or campaign.title,
+        declared_model=campaign.declared_model,
+        assessment=assessment,
+        quality=ready.quality.flags,
+        seconds=time.perf_counter() - began,
+        undetermined=undetermined(fit, data),
+        intervals=bounds,
+    )
+
+
+def fit_structure(structure: Structure, data: Dataset) -> Fit:
+    """The fit from data alone, of a structure with or without effects.
+
+    Effects are added one after another to the fit without them, each led in from its own starts.
+    """
+    fit = start.fit_from_data(replace(structure, effects=()), data)
+    for effect in structure.effects:
+        grown = try_effects(
+            fit.structure,
+            data,
+            fit,
+            [effect],
+            executor=InProcess(),
+            keep=1,
+            far=not fit.converged or fit.chi2_per_dof > GROSS,
+            progress=lambda share, text: None,
+        )
+        if not grown:
+            whole = len(structure.parameters)
+            reason = f"no start exists with the element {effect.key!r}"
+            return failed(structure, data, np.zeros(whole), reason)
+        fit = grown[0].fit
+    return fit
+
+
+def undetermined(fit: Fit, data: Dataset, limit: float = 1.0) -> tuple[str, ...]:
+    """Combinations of parameters that the data do not determine, as readable text.
+
+    Right singular vectors of the whitened Jacobian in relative unknowns (the information's
+    eigenvectors) along which the standard deviation exceeds `limit`: the fit may move so far along
+    them without a misfit to be seen. A positive parameter moves by its own size, a signed one by
+    the larger of its own and the size at which it would matter (`_sizes`).
+    """
+    if not fit.converged:
+        return ()
+    names = fit.structure.parameters.names
+    J = fit.jacobian * _sizes(fit, data)
+    _, sv, Vt = np.linalg.svd(J, full_matrices=False)
+    out = []
+    for s, v in zip(sv, Vt, strict=True):
+        deviation = 1.0 / max(float(s), 1e-12)
+        if deviation <= limit:
+            continue
+        order = [int(i) for i in np.argsort(-np.abs(v)) if abs(v[i]) > 0.2][:4]
+        first = v[order[0]]
+        parts = [f"{names[order[0]]}"]
+        parts += [f"{v[i] / first:+.2g} of {names[i]}".replace("-", "−") for i in order[1:]]
+        how = "not at all" if deviation > 1e6 else f"to a factor of {np.exp(deviation):.2g}"
+        out.append(f"{' with '.join([parts[0], ', '.join(parts[1:])]) if parts[1:] else parts[0]}"
+                   f" ({how})")  # fmt: skip
+    return tuple(out)
+
+
+def _sizes(fit: Fit, data: Dataset) -> FloatArray:
+    """How far each internal unknown must move to matter: 1 (in logarithm) for a positive one; for
+    a residue the largest of its kind; for a coefficient c_d what makes c_d w^d as large as w."""
+    parameters, values = fit.structure.parameters, fit.values
+    largest_w = _largest_input(fit, data)
+    out = []
+    for q in parameters.parameters:
+        size = abs(values[q.name])
+        word = q.name.rpartition(".")[2]
+        if word.endswith("_residue"):
+            size = max(abs(v) for n, v in values.items() if n.endswith(word))
+        elif q.name.startswith("nonlinearity.c"):
+            size = max(size, largest_w ** (1 - int(word[1:])))
+        elif q.name.startswith("nonlinearity.value"):
+            size = max(size, largest_w)
+        out.append(1.0 if q.kind == "positive" else max(size / q.scale, 1.0 if size == 0 else 0.0))
+    return np.array(out)
+
+
+def _largest_input(fit: Fit, data: Dataset) -> float:
+    """Largest amplitude of the flame's input on the measured orbits (m)."""
+    forced = [b for b in data.fit if not b.cold.all()]
+    orbits = [assess.predict(fit.structure, fit.theta, b).orbits for b in forced]
+    return max(float(np.max(np.abs(o.inputs[0]))) for o in orbits)

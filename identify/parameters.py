@@ -1,0 +1,139 @@
+"""Named parameters: physical values outside, well-scaled unknowns inside.
+
+A positive quantity (a frequency, a damping, a time) is fitted by its logarithm, so that no step
+of the optimiser can make it negative; a signed one (a residue, a coefficient) as it is. Standard
+errors are carried through by the derivative of that map.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import dual
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One unknown: its name, unit, the range that is physically plausible, and its map.
+
+    `lower` and `upper` bound what counts as plausible; the fit may leave the range, and the
+    verdict then says so. `scale` is a typical size where the value itself may be zero.
+    """
+
+    name: str
+    unit: str
+    lower: float = -np.inf
+    upper: float = np.inf
+    kind: Literal["positive", "signed"] = "signed"
+    scale: float = 1.0
+
+    def to_internal(self, value: float) -> float:
+        return float(np.log(max(value, 1e-300))) if self.kind == "positive" else value / self.scale
+
+    def to_physical(self, internal: Any) -> Any:
+        """Physical value of an unknown (float or Dual)."""
+        return dual.exp(internal) if self.kind == "positive" else internal * self.scale
+
+    def slope(self, internal: float) -> float:
+        """d(physical)/d(internal)."""
+        return float(np.exp(internal)) if self.kind == "positive" else self.scale
+
+    def plausible(self, value: float) -> bool:
+        return self.lower <= value <= self.upper
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A value with its standard error."""
+
+    value: float
+    stderr: float
+    unit: str
+
+    def to_json(self) -> dict[str, Any]:
+        finite = np.isfinite(self.stderr)
+        return {
+            "value": self.value,
+            "stderr": float(self.stderr) if finite else None,
+            "unit": self.unit,
+        }
+
+    def interval(self, sigmas: float = 1.96) -> tuple[float, float]:
+        return self.value - sigmas * self.stderr, self.value + sigmas * self.stderr
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """Ordered parameters, and the conversions of whole vectors."""
+
+    parameters: tuple[Parameter, ...]
+    index: dict[str, int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        index = {p.name: i for i, p in enumerate(self.parameters)}
+        if len(index) != len(self.parameters):
+            names = [p.name for p in self.parameters]
+            raise ValueError(f"parameter names {names} are not unique")
+        object.__setattr__(self, "index", index)
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.name for p in self.parameters)
+
+    def to_internal(self, values: Sequence[float] | FloatArray) -> FloatArray:
+        pairs = zip(self.parameters, values, strict=True)
+        return np.array([p.to_internal(float(v)) for p, v in pairs])
+
+    def to_physical(self, internal: FloatArray) -> FloatArray:
+        pairs = zip(self.parameters, internal, strict=True)
+        return np.array([float(p.to_physical(float(t))) for p, t in pairs])
+
+    def slopes(self, internal: FloatArray) -> FloatArray:
+        return np.array([p.slope(float(t)) for p, t in zip(self.parameters, internal, strict=True)])
+
+    def seeded(self, internal: FloatArray, rows: int, extra: int = 0) -> dict[str, Any]:
+        """Physical values as Duals, by name, for several vectors at once.
+
+        `internal` is (vectors, p); each vector serves `rows` consecutive rows, so that values
+        have shape (vectors·rows, 1). `extra` more seed columns stay free at the end.
+        """
+        unit = np.eye(len(self), len(self) + extra)
+        columns = np.repeat(internal, rows, axis=0)
+        return {
+            q.name: q.to_physical(dual.Dual(columns[:, j : j + 1], unit[j][None, None, :]))
+            for j, q in enumerate(self.parameters)
+        }
+
+    def plain(self, internal: FloatArray, rows: int = 0) -> dict[str, Any]:
+        """Physical values by name: floats of one vector (p,), or (vectors·rows, 1) of several."""
+        if internal.ndim == 1:
+            return dict(zip(self.names, self.to_physical(internal).tolist(), strict=True))
+        columns = np.repeat(internal, rows, axis=0)
+        return {q.name: q.to_physical(columns[:, j : j + 1]) for j, q in enumerate(self.parameters)}
+
+    def bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Box for the unknowns: a positive quantity stays within its plausible range (where that
+        is finite and not zero), a signed one is free."""
+        low = np.full(len(self), -np.inf)
+        high = np.full(len(self), np.inf)
+        for i, p in enumerate(self.parameters):
+            if p.kind == "positive":
+                low[i] = np.log(p.lower) if p.lower > 0 else -60.0
+                high[i] = np.log(p.upper) if np.isfinite(p.upper) else 60.0
+        return low, high
+
+    def estimates(self, internal: FloatArray, covariance: FloatArray) -> dict[str, Estimate]:
+        """Values with standard errors from the internal covariance, shape (p, p)."""
+        stderr = np.sqrt(np.maximum(np.diag(covariance), 0.0)) * np.abs(self.slopes(internal))
+        values = self.to_physical(internal)
+        rows = zip(self.parameters, values, stderr, strict=True)
+        return {p.name: Estimate(float(v), float(e), p.unit) for p, v, e in rows}

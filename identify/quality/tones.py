@@ -1,0 +1,194 @@
+"""Foreign tones: lines that are there whatever the rig does.
+
+A line is interference when it stands at the same frequency, to within a bin, in more than half of
+the runs where it could be seen. A rig's own narrow resonance, shaken by turbulence, peaks
+elsewhere in every run: where such scattered peaks surround it, a line is not believed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify.chances import chi2_tail
+from identify.quality.entrainment import FreeLine
+from identify.quality.findings import finding
+from identify.quality.lines import Lines, Peak, crest, lines, peaks
+from identify.quality.spectrum import tail
+from identify.quality.view import View
+from identify.results import QualityFlag
+
+ALONE = 100.0  # power over noise of a line that is named though no other run has it
+PURE = 4.0  # power over that of the bins beside it, of a line; of one found alone twice that
+PURE_KNOWN = 1.0  # where other runs have a line: what the chance PRESENT stands for
+PRESENT = 1e-3  # chance below which a known tone counts as present in a run
+ALPHA = 1e-6  # chance of a tone among noise, all runs and bins considered
+SAME_BINS = 0.75  # peaks this near belong together
+AROUND_BINS = 15.0  # where scattered peaks betray a resonance
+OWN = 0.2  # of the run's frequency, next to which the rig's own resonance stands
+ORDERS = 200  # harmonics of a discontinuous loop that may fold into the band
+LEAST_ALONE = 5e-4  # of the fundamental: a smaller line in one run harms nothing
+SEEN_SHARE = 0.4  # of the runs in which a tone must not be hidden by the rig's own lines
+MAINS_HZ = (50.0, 60.0)
+
+
+@dataclass(frozen=True)
+class Tone:
+    """A foreign tone. `amplitude` (peak) and `stderr` are of the velocity, in `unit`; `runs`
+    those where it is significant; `p_value` that of noise doing this anywhere in the spectra."""
+
+    frequency_hz: float
+    amplitude: float
+    stderr: float
+    unit: str
+    runs: tuple[str, ...]
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """A tone in one run: its bin and power over noise there."""
+
+    where: Lines
+    bin: int
+    ratio: float
+
+    @property
+    def view(self) -> View:
+        return self.where.view
+
+    @property
+    def chance(self) -> float:
+        """Of noise being so high in one of the three bins looked at."""
+        return min(1.0, 3 * float(tail(self.ratio)))
+
+
+def tones(
+    views: Sequence[View], free: FreeLine | None
+) -> tuple[tuple[Tone, ...], list[QualityFlag]]:
+    """Tones common to most runs, and flags of every run's foreign lines."""
+    searched = [lines(v, free) for v in views]
+    found = [p for i, s in enumerate(searched) for p in peaks(s, i)]
+    if not found:
+        return (), []
+    width = float(np.median([v.bin_hz for v in views]))
+    out: list[Tone] = []
+    flags: list[QualityFlag] = []
+    for members in clusters([p for p in found if p.purity > PURE], SAME_BINS * width):
+        frequency = float(np.median([p.frequency_hz for p in members]))
+        around = scattered(found, frequency, width)
+        present = sightings(searched, frequency)
+        if len({p.run for p in members}) > 1 and present and 4 * around <= len(present):
+            tone = common(searched, frequency, present)
+            if tone is not None:
+                out.append(tone)
+                flags += [line_flag(s, frequency, True) for s in present]
+                continue
+        for p in members:
+            lone = p.ratio > ALONE and p.purity > 2 * PURE and around == 0
+            where = searched[p.run]
+            own = where.view.frequency_hz
+            level = np.abs(where.view.spectrum[:, p.bin]) / np.maximum(where.view.level, 1e-300)
+            lone = lone and bool(level.max() > LEAST_ALONE)
+            if lone and abs(p.frequency_hz - own) > OWN * own and not derived(p, found, where.view):
+                sighting = Sighting(where, p.bin, p.ratio)
+                flags.append(line_flag(sighting, p.frequency_hz, False))
+    return tuple(out), flags
+
+
+def clusters(found: Sequence[Peak], width_hz: float) -> list[list[Peak]]:
+    """Peaks that lie within `width_hz` of the next lower one."""
+    out: list[list[Peak]] = []
+    for p in sorted(found, key=lambda q: q.frequency_hz):
+        if out and p.frequency_hz - out[-1][-1].frequency_hz < width_hz:
+            out[-1].append(p)
+        else:
+            out.append([p])
+    return out
+
+
+def scattered(found: Sequence[Peak], frequency_hz: float, width_hz: float) -> int:
+    """Number of peaks around a frequency, but not at it."""
+    distance = np.array([abs(p.frequency_hz - frequency_hz) for p in found]) / width_hz
+    return int(np.count_nonzero((distance > 1.5) & (distance < AROUND_BINS)))
+
+
+def derived(peak: Peak, found: Sequence[Peak], view: View) -> bool:
+    """Whether a line is k·f folded, or k·f ± m·g of the run's forcing f and a stronger line g."""
+    rate = view.run.sample_rate_hz
+    harmonics = view.frequency_hz * np.arange(ORDERS)
+    folded = np.abs(harmonics - rate * np.round(harmonics / rate))
+    if np.min(np.abs(folded - peak.frequency_hz)) < 0.3 * view.bin_hz:
+        return True
+    stronger = [p.frequency_hz for p in found if p.run == peak.run and p.ratio > peak.ratio]
+    k = np.arange(-6, 7)[:, None]
+    m = np.arange(1, 4)[None, :]
+    for g in stronger:
+        at = np.abs(k * view.frequency_hz + m * g)
+        if np.min(np.abs(at - peak.frequency_hz)) < 2 * view.bin_hz:
+            return True
+    return False
+
+
+def sightings(searched: Sequence[Lines], frequency_hz: float) -> list[Sighting]:
+    """The runs in which a tone is, if they are most of those that could show it; else none."""
+    seen = [Sighting(s, *s.at(frequency_hz)) for s in searched]
+    seen = [s for s in seen if s.ratio >= 0]
+    present = [s for s in seen if s.chance < PRESENT and s.where.purity(s.bin) > PURE_KNOWN]
+    if len(present) < 2 or 2 * len(present) <= len(seen):
+        return []
+    return present if len(seen) >= SEEN_SHARE * len(searched) else []
+
+
+def common(
+    searched: Sequence[Lines], frequency_hz: float, present: Sequence[Sighting]
+) -> Tone | None:
+    """The tone with its mean amplitude; None when noise could do it (Fisher's sum over runs)."""
+    seen = [Sighting(s, *s.at(frequency_hz)) for s in searched]
+    chance = np.array([s.chance for s in seen if s.ratio >= 0])
+    statistic = -2 * float(np.sum(np.log(np.maximum(chance, 1e-300))))
+    bins = max(s.ratio.size for s in searched)
+    p_value = min(1.0, bins * chi2_tail(statistic, 2 * chance.size))
+    if p_value > ALPHA:
+        return None
+    amplitude = np.array([velocity(s) for s in present])
+    noise = amplitude / np.sqrt([max(s.ratio, 1.0) for s in present])
+    spread = float(np.std(amplitude, ddof=1)) / np.sqrt(amplitude.size)
+    stderr = max(spread, float(np.sqrt(np.sum(noise**2)) / amplitude.size))
+    first = present[0].view
+    unit = "m/s" if first.microphones is not None else first.run.signals[first.inputs[0]].unit
+    names = tuple(s.view.name for s in present)
+    return Tone(frequency_hz, float(np.mean(amplitude)), stderr, unit, names, p_value)
+
+
+def velocity(sighting: Sighting) -> float:
+    """Amplitude of the velocity there, with the window's loss between bins taken back."""
+    view, b = sighting.view, sighting.bin
+    _, factor = crest(view, b)
+    return abs(view.velocity_of(view.spectrum[:, b], b * view.bin_hz)) * factor
+
+
+def mains_order(frequency_hz: float, tolerance_hz: float) -> tuple[int, float] | None:
+    """(order, mains frequency) when a frequency is a multiple of 50 or 60 Hz."""
+    for mains in MAINS_HZ:
+        order = round(frequency_hz / mains)
+        if 1 <= order <= 20 and abs(frequency_hz - order * mains) < tolerance_hz + 0.1 * order:
+            return order, mains
+    return None
+
+
+def line_flag(sighting: Sighting, frequency_hz: float, consistent: bool) -> QualityFlag:
+    view = sighting.view
+    own = np.abs(view.spectrum[:, sighting.bin])
+    i = int(np.argmax(own / np.maximum(view.level, 1e-300)))
+    mains = mains_order(frequency_hz, 0.5 * view.bin_hz)
+    text = (
+        f"line at {frequency_hz:.2f} Hz, {own[i]:.3g} {view.run.signals[view.inputs[i]].unit} in "
+        f"{view.inputs[i]} ({own[i] / view.level[i]:.1e} of the fundamental, "
+        f"{10 * np.log10(sighting.ratio):.0f} dB above the noise), "
+        + ("in most runs" if consistent else "in this run alone")
+    )
+    if mains is not None:
+        remedy = f"; {mains[0]} × {mains[1]:g} Hz: look for a ground loop"
+        return finding(view.name, "mains_hum", "noted", text + remedy)
+    return finding(view.name, "foreign_tone", "noted", text + "; look for its source")

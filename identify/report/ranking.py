@@ -1,0 +1,65 @@
+"""Candidates ranked: misfit and validation error, each with the line that noise draws."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from identify.report import theme
+from identify.report.words import label, scientific
+from identify.results import Candidate, Diagnosis
+
+MOST = 14  # candidates shown; the table has them all
+
+
+@theme.styled
+def ranking(d: Diagnosis) -> Figure:
+    """χ² per degree of freedom and validation error of each candidate beside the declared model."""
+    candidates = d.candidates[:MOST]
+    names = ["declared model", *(label(c) for c in candidates)]
+    chi2 = np.array([d.before.chi2_per_dof, *(c.chi2_per_dof for c in candidates)])
+    errors = np.array([d.before.validation_error, *(c.validation_error for c in candidates)])
+    colours = [theme.BEFORE, *(_colour(c, d) for c in candidates)]
+    y = np.arange(len(names))
+    longest = max(len(n) for n in names)
+    margins = theme.Margins(left=0.3 + 0.062 * longest, across=0.15)
+    figure, axes = theme.panels(
+        0.75 + 0.24 * len(names), 1, 2, margins, widths=(1.4, 1), sharey=True
+    )
+    left, right = axes[0]
+    finite = chi2[np.isfinite(chi2) & (chi2 > 0)]
+    start = min(0.3, float(finite.min()) / 2) if finite.size else 0.3
+    length = np.where(np.isfinite(chi2), np.maximum(chi2, start) - start, 0.0)
+    left.barh(y, length, left=start, color=colours, height=0.62)
+    for at, value in zip(y, chi2, strict=True):
+        if np.isfinite(value):
+            left.annotate(scientific(float(value)), (max(value, start), at), xytext=(3, 0),
+                          textcoords="offset points", va="center", fontsize=7,
+                          bbox={"fc": theme.PAPER, "ec": "none", "pad": 0.6})  # fmt: skip
+        else:
+            left.annotate("not converged", (start, at), xytext=(3, 0),
+                          textcoords="offset points", va="center", fontsize=7)  # fmt: skip
+    left.axvline(1.0, color=theme.NOISE, lw=1.0, ls="--")
+    if np.isfinite(d.noise_floor):
+        right.axvline(d.noise_floor * 100, color=theme.NOISE, lw=1.0, ls="--")
+    for at, value, colour in zip(y, errors, colours, strict=True):
+        if np.isfinite(value):
+            right.plot(value * 100, at, "o", color=colour)
+    for ax, x in ((left, 1.0), (right, d.noise_floor * 100)):
+        ax.set_xscale("log")
+        ax.grid(axis="y", visible=False)
+        ax.annotate("noise", (x, 1.0), xycoords=("data", "axes fraction"), xytext=(2, 1),
+                    textcoords="offset points", fontsize=7, color=theme.MUTED)  # fmt: skip
+    theme.decades(left.xaxis)
+    theme.narrow_decades(right.xaxis)
+    left.set_xlim(start, (float(finite.max()) if finite.size else 1.0) * 6)
+    left.set_yticks(y, names)
+    left.invert_yaxis()
+    left.set_xlabel("χ² per degree of freedom")
+    right.set_xlabel("validation error (%)")
+    return figure
+
+
+def _colour(c: Candidate, d: Diagnosis) -> str:
+    claimed = sorted(e.effect for e in d.effects)
+    if claimed and sorted(c.effects) == claimed:
+        return theme.AFTER
+    return theme.GOOD if c.adequate and c.plausible else theme.NOISE

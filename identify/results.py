@@ -1,0 +1,337 @@
+"""What identification and tracing hand over: plain, frozen, printable, and JSON by contract.
+
+An `Assessment` is one model against the data: errors, χ², parameters, and every compared
+coefficient, from which tables and figures are made. An `Identification` holds one assessment, a
+`Diagnosis` two (before, after) with the evidence that leads from one to the other.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from identify.fit import Fit
+from identify.lockin import LockIn
+from identify.parameters import Estimate
+from identify.profile import Interval
+from identify.record import DeclaredModel
+from identify.structure import Structure
+from identify.whiteness import ResidualTest
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+Verdict = Literal["no_discrepancy", "traced", "ambiguous", "unexplained"]
+
+
+@dataclass(frozen=True)
+class QualityFlag:
+    """Something wrong with one run's recording. `severity`: noted, down-weighted or excluded."""
+
+    run: str
+    flag: str
+    detail: str
+    severity: Literal["noted", "down_weighted", "excluded"] = "noted"
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "run": self.run,
+            "flag": self.flag,
+            "detail": self.detail,
+            "severity": self.severity,
+        }
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One run: measured and predicted Fourier coefficients of the velocity, (K,) complex, m/s.
+
+    `stderr` is √E|noise|² of each coefficient, `predicted_stderr` that of the prediction, from
+    the parameters' covariance (None: not converged). A free run is turned so that both fundamentals
+    are real; `predicted_hz` is its own model frequency.
+    """
+
+    run: str
+    kind: str
+    role: str
+    frequency_hz: float
+    predicted_hz: float
+    amplitude_v: float | None
+    started_s: float
+    measured: ComplexArray
+    predicted: ComplexArray
+    stderr: FloatArray
+    predicted_stderr: FloatArray | None = None
+
+    @property
+    def normalised(self) -> ComplexArray:
+        """(measured − predicted)/stderr, of order one where the model is right."""
+        return np.asarray((self.measured - self.predicted) / self.stderr)
+
+
+@dataclass(frozen=True)
+class LimitCycle:
+    """A free limit cycle: frequency (Hz), amplitude of the velocity (m/s), harmonics over the
+    fundamental; standard errors where they exist. Of a model's cycle: whether it is `stable`, and
+    the rate (1/s, negative: a decay) of the disturbance that dies out last."""
+
+    frequency_hz: float
+    amplitude: float
+    harmonics: tuple[float, ...]
+    frequency_stderr_hz: float | None = None
+    amplitude_stderr: float | None = None
+    stable: bool | None = None
+    harmonics_stderr: tuple[float, ...] | None = None
+    leading_rate_per_s: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "frequency_hz": self.frequency_hz,
+            "amplitude": self.amplitude,
+            "harmonics": list(self.harmonics),
+            "frequency_stderr_hz": self.frequency_stderr_hz,
+            "amplitude_stderr": self.amplitude_stderr,
+            "stable": self.stable,
+            "harmonics_stderr": None
+            if self.harmonics_stderr is None
+            else list(self.harmonics_stderr),
+            "leading_rate_per_s": self.leading_rate_per_s,
+        }
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """One fitted model against the data."""
+
+    structure: Structure
+    fit: Fit
+    fit_error: float
+    validation_error: float
+    noise_floor: float
+    comparisons: tuple[Comparison, ...]
+    measured_cycle: LimitCycle | None
+    model_cycle: LimitCycle | None
+    cross_validated: bool = False
+    lock_in: tuple[LockIn, ...] = ()
+    residual_tests: tuple[ResidualTest, ...] = ()
+
+    @property
+    def chi2_per_dof(self) -> float:
+        return self.fit.chi2_per_dof
+
+    @property
+    def dof(self) -> int:
+        return self.fit.dof
+
+    @property
+    def parameters(self) -> dict[str, Estimate]:
+        return self.fit.estimates
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "converged": self.fit.converged,
+            "reason": self.fit.reason,
+            "fit_error": number(self.fit_error),
+            "validation_error": number(self.validation_error),
+            "chi2_per_dof": number(self.chi2_per_dof),
+            "dof": self.dof,
+            "parameters": {n: e.to_json() for n, e in self.parameters.items()}
+            if self.fit.converged
+            else {},
+            "lock_in_boundary": [
+                {
+                    "run": b.run,
+                    "frequency_hz": b.frequency_hz,
+                    "drive_v": b.measured_v,
+                    "boundary_v": b.boundary_v,
+                    "boundary_stderr_v": number(b.stderr_v),
+                    "lost_by": b.kind,
+                }
+                for b in self.lock_in
+            ],
+            "validation_predictions": [
+                {
+                    "run": c.run,
+                    "frequency_hz": c.frequency_hz,
+                    "amplitude_v": c.amplitude_v,
+                    "measured": _complex(c.measured),
+                    "predicted": _complex(c.predicted),
+                    "stderr": [float(x) for x in c.stderr],
+                    "predicted_stderr": None
+                    if c.predicted_stderr is None
+                    else [number(x) for x in c.predicted_stderr],
+                }
+                for c in self.comparisons
+                if c.role == "validation"
+            ],
+            "residual_tests": {
+                t.name: {"statistic": number(t.statistic), "p_value": number(t.p_value)}
+                for t in self.residual_tests
+            },
+        }
+
+
+@dataclass(frozen=True)
+class Identification:
+    """The declared model fitted to a campaign."""
+
+    campaign: str
+    declared_model: DeclaredModel
+    assessment: Assessment
+    quality: tuple[QualityFlag, ...]
+    seconds: float
+    undetermined: tuple[str, ...] = ()  # combinations of parameters that the data do not fix
+    intervals: Mapping[str, Interval] = field(default_factory=dict)  # 95 %, by parameter
+
+    def to_json(self) -> dict[str, Any]:
+        a = self.assessment
+        return {
+            "format": "identification/1",
+            "campaign": self.campaign,
+            "declared_model": declared_json(self.declared_model),
+            **a.to_json(),
+            "noise_floor": number(a.noise_floor),
+            "free_limit_cycle": {
+                "measured": None if a.measured_cycle is None else a.measured_cycle.to_json(),
+                "model": None if a.model_cycle is None else a.model_cycle.to_json(),
+            },
+            "quality": [q.to_json() for q in self.quality],
+            "undetermined": list(self.undetermined),
+            "intervals_95": {
+                n: {"lower": i.lower, "upper": i.upper, "by": i.method}
+                for n, i in self.intervals.items()
+            },
+            "seconds": self.seconds,
+        }
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One set of effects added to the declared model and refitted."""
+
+    effects: tuple[str, ...]
+    forms: tuple[str, ...]
+    locations: tuple[str, ...]
+    chi2: float
+    chi2_per_dof: float
+    validation_error: float
+    p_value: float  # of the gain in χ² over the next smaller model, corrected for the search
+    parameters: Mapping[str, Estimate]
+    equivalent_to: tuple[str, ...] = ()
+    plausible: bool = True
+    adequate: bool = False  # its own lack of fit is within noise
+    note: str = ""
+
+    @property
+    def key(self) -> str:
+        return " + ".join(self.effects)
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "effects": list(self.effects),
+            "forms": list(self.forms),
+            "locations": list(self.locations),
+            "chi2_per_dof": number(self.chi2_per_dof),
+            "validation_error": number(self.validation_error),
+            "p_value": number(self.p_value),
+            "parameters": {n: e.to_json() for n, e in self.parameters.items()},
+            "equivalent_to": list(self.equivalent_to),
+            "plausible": self.plausible,
+            "adequate": self.adequate,
+            "note": self.note,
+        }
+
+
+@dataclass(frozen=True)
+class TracedEffect:
+    """One effect of the verdict, with its parameters."""
+
+    effect: str
+    location: str
+    form: str
+    parameters: Mapping[str, Estimate]
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "effect": self.effect,
+            "location": self.location,
+            "form": self.form,
+            "parameters": {n: e.to_json() for n, e in self.parameters.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Whether the declared model's misfit exceeds the noise, and what it looks like."""
+
+    significant: bool
+    p_value: float
+    signature: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "significant": self.significant,
+            "p_value": number(self.p_value),
+            "signature": dict(self.signature),
+        }
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the declared model lacks, or that nothing known explains it."""
+
+    campaign: str
+    declared_model: DeclaredModel
+    quality: tuple[QualityFlag, ...]
+    before: Assessment
+    residual: Residual
+    candidates: tuple[Candidate, ...]
+    verdict: Verdict
+    effects: tuple[TracedEffect, ...]
+    after: Assessment
+    next_experiment: Mapping[str, Any] | None
+    seconds: float
+    explanation: str = ""
+
+    @property
+    def noise_floor(self) -> float:
+        return self.before.noise_floor
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "format": "diagnosis/1",
+            "campaign": self.campaign,
+            "declared_model": declared_json(self.declared_model),
+            "seconds": self.seconds,
+            "quality": [q.to_json() for q in self.quality],
+            "noise_floor": number(self.noise_floor),
+            "before": self.before.to_json(),
+            "residual": self.residual.to_json(),
+            "candidates": [c.to_json() for c in self.candidates],
+            "verdict": self.verdict,
+            "effects": [e.to_json() for e in self.effects],
+            "after": self.after.to_json(),
+            "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
+            "explanation": self.explanation,
+        }
+
+
+def _complex(c: ComplexArray) -> list[list[float | None]]:
+    """Complex numbers as [real, imaginary]."""
+    return [[number(x.real), number(x.imag)] for x in c]
+
+
+def number(x: float) -> float | None:
+    """A JSON number, or null where there is none: JSON has no NaN and no infinity."""
+    return float(x) if np.isfinite(x) else None
+
+
+def declared_json(model: DeclaredModel) -> dict[str, Any]:
+    return {
+        "modes": model.modes,
+        "flame": model.flame,
+        "nonlinearity": model.nonlinearity,
+        "nonlinearity_degree": model.nonlinearity_degree,
+        **dict(model.options),
+    }

@@ -1,0 +1,439 @@
+"""The loop as a declared structure: what it is made of, and its equations at harmonics of ω.
+
+    velocity      Y = Σ_i b_i(s) [ r_i s F + a_i U' − L_i ],   b_i(s) = s / (s² + 2ζ_i ω_i s + ω_i²)
+    flame input   w = H(s) Y,       first order: H = 1 / (s + ω_f)          (Eq. 4.12)
+    flame output  F = N(w) = w + c2 w² + c3 w³ + …             slope one: the gain sits in r_i
+    drive         U' = A(s) · g(U)
+    measurement   M = sensor(Y)
+
+`r_i` = k_f · 22.5 · ψ_i(xf) D_i and `a_i` = ψ_i(xa) D_i in the thesis's terms: only these products
+are identifiable from one velocity signal, so four numbers describe a mode. The single
+nonlinearity enters once. `L_i` is an amplitude-dependent loss, absent unless declared.
+
+A `Structure` is a base plus effects; each effect may change any one of these pieces through the
+hooks of `Effect`. Written once with numbers or Duals alike, the same lines give the equations and
+their derivatives.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import dual
+from identify.dual import Dual
+from identify.parameters import Parameter, ParameterSet
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+Values = Mapping[str, Any]  # physical parameter values by name: floats or Duals
+Characteristic = Callable[[Any], Any]  # static function of time samples, shape (runs, samples)
+NONLINEARITIES = ("polynomial", "saturation", "lagrange", "linear")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """What is known of a batch of runs before any model: one row a run, one column a harmonic.
+
+    Arrays of shape (runs,) or (runs, harmonics); `drive`, `pressure` and `velocity` are measured
+    Fourier coefficients, zero above the harmonics that were measured. `time` runs from 0 at the
+    campaign's start to 1 at the start of its last run; `flame_on` is 0 for cold runs.
+    """
+
+    omega: FloatArray
+    drive: ComplexArray
+    pressure: ComplexArray
+    velocity: ComplexArray
+    time: FloatArray
+    flame_on: FloatArray
+    identity: npt.NDArray[np.int64]
+    free: bool = False
+    spacing_m: float = 0.0508
+    centre_m: float = 0.6858
+    density_kg_m3: float = 1.2
+    sound_speed_m_s: float = 343.0
+
+    @property
+    def runs(self) -> int:
+        return int(self.omega.size)
+
+    @property
+    def harmonics(self) -> int:
+        return int(self.drive.shape[1])
+
+    def take(self, rows: npt.NDArray[np.int64]) -> "Conditions":
+        """The same for some of the runs."""
+        names = ("omega", "drive", "pressure", "velocity", "time", "flame_on", "identity")
+        return replace(self, **{n: getattr(self, n)[rows] for n in names})
+
+    def tile(self, times: int) -> "Conditions":
+        """All runs repeated `times` times, for as many parameter vectors at once."""
+        return self.take(np.tile(np.arange(self.runs), times)) if times > 1 else self
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One acoustic mode; each value a number, a Dual, or either with one row a run."""
+
+    frequency_hz: Any
+    damping: Any
+    flame_residue: Any
+    speaker_residue: Any
+    sensor_ratio: Any = None  # velocity at the sensor over velocity at the flame; None: 1
+
+
+@dataclass(frozen=True)
+class Preceded:
+    """A characteristic with an operator before it that has corners or remembers, and so needs
+    whole periods, finely sampled.
+
+    Called like any other it is the curve alone (small signals, plots of N).
+    """
+
+    curve: Characteristic
+    operator: Characteristic
+
+    def __call__(self, w: Any) -> Any:
+        return self.curve(w)
+
+    def periodic(self, w: Any) -> Any:
+        """The output over one period, (runs, samples)."""
+        return self.curve(self.operator(w))
+
+
+@dataclass(frozen=True)
+class Loss:
+    """An amplitude-dependent loss L_i = `coefficients`[i] · g(v), v = Σ `weights`[i] · y_i.
+
+    y_i is mode i's part of the flame's velocity: weights of one make v that velocity.
+    """
+
+    coefficients: Sequence[Any]
+    characteristic: Characteristic
+    weights: Sequence[Any]
+
+
+class Effect:
+    """Something that a declared model may lack: parameters, and changes to pieces of the loop.
+
+    A subclass sets `name`, `location`, `form` and `parameters` and overrides the hooks it needs;
+    every hook defaults to «no change». `p` maps the effect's own parameter names to values.
+    `starts` proposes starting values from what is known: rows of physical values.
+    """
+
+    name: str = ""
+    location: str = ""
+    form: str = ""
+    parameters: tuple[Parameter, ...] = ()
+    needs: tuple[str, ...] = ()  # what the campaign must hold, e.g. "pressure"
+    generalises: tuple[str, ...] = ()  # effects of which this is an extension, not a rival
+    mode_count: int | None = None  # only for declared models of that many modes
+    empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
+
+    def starts(self, known: "Known") -> list[tuple[float, ...]]:
+        raise NotImplementedError(f"effect {self.name!r} proposes no starting values")
+
+    def neutral(self) -> tuple[float, ...] | None:
+        """Values at which the effect vanishes, where a score test can be taken; None: nowhere."""
+        return None
+
+    def restated(self, structure: "Structure") -> "Structure | None":
+        """A richer structure without the effect that says the same, if there is one: its own
+        starting values then serve too."""
+        return None
+
+    def from_restated(self, structure: "Structure", values: Mapping[str, float]) -> list[float]:
+        """Values of `structure` with this effect, in order, from those of `restated`."""
+        raise NotImplementedError(f"effect {self.name!r} has no restated structure")
+
+    def to_restated(self, structure: "Structure", values: Mapping[str, float]) -> dict[str, float]:
+        """Values of `restated` from those of `structure` with this effect."""
+        raise NotImplementedError(f"effect {self.name!r} has no restated structure")
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        return modes
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return 1.0
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        return n
+
+    def operator(self, p: Values) -> Characteristic | None:
+        """What acts on the flame's input before the characteristic and has corners or remembers:
+        it takes one period of time samples, (runs, samples), periodically continued."""
+        return None
+
+    def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss | None:
+        return None
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        return u
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        return 1.0
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        return y
+
+    @property
+    def key(self) -> str:
+        return f"{self.name}:{self.form}" if self.form else self.name
+
+
+@dataclass(frozen=True)
+class Known:
+    """What starting values may lean on: sizes of the declared fit, never a simulator's truth."""
+
+    free_hz: float
+    modes_hz: tuple[float, ...]
+    modes_damping: tuple[float, ...]
+    flame_residues: tuple[float, ...]
+    speaker_residues: tuple[float, ...]
+    flame_input_amplitude: float
+    velocity_amplitude: float
+    drive_amplitude: float
+    band_hz: tuple[float, float]
+    runs: int
+
+
+@dataclass(frozen=True)
+class Loop:
+    """The assembled equations for one batch: transfer functions (runs, harmonics) and functions.
+
+    loops a, b: 0 is the flame, 1 the loss if there is one.
+        v_a = Σ_b P[a][b] N_b(v_b) + Q[a],   Y = Σ_b G[b] N_b(v_b) + G_u
+    """
+
+    P: tuple[tuple[Any, ...], ...]
+    Q: tuple[Any, ...]
+    G: tuple[Any, ...]
+    G_u: Any
+    N: tuple[Characteristic, ...]
+    sensor: Callable[[Any], Any]
+    H: Any
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A declared model: number of modes, flame path, nonlinearity, and effects added to it.
+
+    `flame_order` counts first-order low-passes in the flame path; `flame_delay` adds a delay.
+    `nonlinearity` is ``polynomial`` of `degree`, ``saturation`` (tanh), ``lagrange`` (through
+    values at given nodes, Eq. 3.22) or ``linear``; all have slope one at zero.
+    """
+
+    mode_count: int = 2
+    flame_order: int = 1
+    flame_delay: bool = False
+    nonlinearity: str = "polynomial"
+    degree: int = 3
+    nodes: tuple[float, ...] = ()
+    effects: tuple[Effect, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.mode_count < 1:
+            raise ValueError(f"modes={self.mode_count} is not an integer >= 1")
+        if self.flame_order < 0:
+            raise ValueError(f"flame_order={self.flame_order} is not an integer >= 0")
+        if self.nonlinearity not in NONLINEARITIES:
+            raise ValueError(f"nonlinearity={self.nonlinearity!r} is not one of {NONLINEARITIES}")
+        if self.nonlinearity == "polynomial" and self.degree < 2:
+            raise ValueError(f"nonlinearity_degree={self.degree} is not an integer >= 2")
+        if self.nonlinearity == "lagrange" and len(self.nodes) < 2:
+            raise ValueError(f"nodes={self.nodes} are not at least two values other than zero")
+
+    @property
+    def base_parameters(self) -> tuple[Parameter, ...]:
+        out: list[Parameter] = []
+        for i in range(1, self.mode_count + 1):
+            out += [
+                Parameter(f"mode{i}.frequency_hz", "Hz", 1.0, 1e5, "positive"),
+                Parameter(f"mode{i}.damping", "1", 1e-4, 1.5, "positive"),
+                Parameter(f"mode{i}.flame_residue", "1/s"),
+                Parameter(f"mode{i}.speaker_residue", "m/s²/V"),
+            ]
+        for j in range(1, self.flame_order + 1):
+            name = "flame.pole_hz" if j == 1 else f"flame.pole{j}_hz"
+            out.append(Parameter(name, "Hz", 0.5, 1e5, "positive"))
+        if self.flame_delay:
+            out.append(Parameter("flame.delay_s", "s", 1e-7, 0.05, "positive"))
+        return (*out, *_characteristic_parameters(self))
+
+    @cached_property
+    def parameters(self) -> ParameterSet:
+        own = [p for e in self.effects for p in e.parameters]
+        return ParameterSet((*self.base_parameters, *own))
+
+    def with_effects(self, *effects: Effect) -> "Structure":
+        return replace(self, effects=(*self.effects, *effects))
+
+    def assemble(self, p: Values, at: Conditions, s: Any) -> Loop:
+        """The loop's equations at the complex frequencies `s`, shape (runs, harmonics)."""
+        modes = [
+            Mode(
+                p[f"mode{i}.frequency_hz"],
+                p[f"mode{i}.damping"],
+                p[f"mode{i}.flame_residue"],
+                p[f"mode{i}.speaker_residue"],
+            )
+            for i in range(1, self.mode_count + 1)
+        ]
+        for e in self.effects:
+            modes = e.modes(p, at, modes)
+        resonators = [_resonator(m, s) for m in modes]
+        H = self._flame_path(p, at, s)
+        drive: Any = at.drive
+        for e in self.effects:
+            drive = e.drive(p, at, drive)
+        for e in self.effects:
+            drive = e.actuator(p, at, s) * drive
+        on = at.flame_on[:, None]
+        at_flame = (
+            _sum(b * m.flame_residue for b, m in zip(resonators, modes, strict=True)) * s * on
+        )
+        from_drive = _sum(b * m.speaker_residue for b, m in zip(resonators, modes, strict=True))
+        seen_flame, seen_drive = at_flame, from_drive
+        if any(m.sensor_ratio is not None for m in modes):
+            ratios = [1.0 if m.sensor_ratio is None else m.sensor_ratio for m in modes]
+            seen = [b * q for b, q in zip(resonators, ratios, strict=True)]
+            seen_flame = (
+                _sum(b * m.flame_residue for b, m in zip(seen, modes, strict=True)) * s * on
+            )
+            seen_drive = _sum(b * m.speaker_residue for b, m in zip(seen, modes, strict=True))
+
+        def sensor(y: Any) -> Any:
+            for e in self.effects:
+                y = e.sensor(p, at, s, y)
+            return y
+
+        n = self._characteristic(p)
+        for e in self.effects:
+            n = e.characteristic(p, n, at)
+        for e in self.effects:
+            if (operator := e.operator(p)) is not None:
+                n = Preceded(n, operator)
+        losses = [x for e in self.effects if (x := e.loss(p, at, modes)) is not None]
+        if not losses:
+            q = H * (from_drive * drive)
+            return Loop(
+                ((H * at_flame,),), (q,), (seen_flame,), seen_drive * drive, (n,), sensor, H
+            )
+        if len(losses) > 1:
+            raise ValueError("two effects declare an amplitude-dependent loss; one at most")
+        loss = losses[0]
+        lossy = -_sum(b * c for b, c in zip(resonators, loss.coefficients, strict=True))
+        felt = [b * w for b, w in zip(resonators, loss.weights, strict=True)]
+        row = (
+            _sum(b * m.flame_residue for b, m in zip(felt, modes, strict=True)) * s * on,
+            -_sum(b * c for b, c in zip(felt, loss.coefficients, strict=True)),
+        )
+        q_loss = _sum(b * m.speaker_residue for b, m in zip(felt, modes, strict=True)) * drive
+        return Loop(
+            ((H * at_flame, H * lossy), row),
+            (H * (from_drive * drive), q_loss),
+            (seen_flame, lossy),
+            seen_drive * drive,
+            (n, loss.characteristic),
+            sensor,
+            H,
+        )
+
+    def _flame_path(self, p: Values, at: Conditions, s: Any) -> Any:
+        H: Any = 1.0
+        for j in range(1, self.flame_order + 1):
+            pole = 2 * np.pi * p["flame.pole_hz" if j == 1 else f"flame.pole{j}_hz"]
+            H = _low_pass(None if j == 1 else pole, pole, s) * H
+        if self.flame_delay:
+            H = H * dual.exp(-(s * p["flame.delay_s"]))
+        for e in self.effects:
+            H = H * e.flame(p, at, s)
+        return H
+
+    def _characteristic(self, p: Values) -> Characteristic:
+        if self.nonlinearity == "linear":
+            return lambda w: w
+        if self.nonlinearity == "saturation":
+            level = p["nonlinearity.level"]
+            return lambda w: level * dual.tanh(w / level)
+        if self.nonlinearity == "lagrange":
+            values = [p[f"nonlinearity.value{j}"] for j in range(1, len(self.nodes) + 1)]
+            coefficients = _lagrange_coefficients(self.nodes, values)
+        else:
+            coefficients = [p[f"nonlinearity.c{d}"] for d in range(2, self.degree + 1)]
+
+        def polynomial(w: Any) -> Any:
+            x = dual.value(w)
+            plain = [dual.value(c) for c in coefficients]
+            total: Any = 0.0  # Horner's scheme from the highest degree down
+            slope: Any = 0.0
+            for d, c in reversed(list(enumerate(plain, start=2))):
+                total = (total + c) * x
+                slope = (slope + d * c) * x
+            value = x * (total + 1.0)
+            if not isinstance(w, Dual) and not any(isinstance(c, Dual) for c in coefficients):
+                return value
+            powers = [x * x]
+            for _ in coefficients[1:]:
+                powers.append(powers[-1] * x)
+            pairs = zip(powers, coefficients, strict=True)
+            return dual.chain(value, (slope + 1.0, w), *pairs)
+
+        return polynomial
+
+
+def _characteristic_parameters(structure: Structure) -> list[Parameter]:
+    if structure.nonlinearity == "polynomial":
+        return [
+            Parameter(f"nonlinearity.c{d}", f"m^-{d - 1}") for d in range(2, structure.degree + 1)
+        ]
+    if structure.nonlinearity == "saturation":
+        return [Parameter("nonlinearity.level", "m", 0.0, np.inf, "positive")]
+    if structure.nonlinearity == "lagrange":
+        return [Parameter(f"nonlinearity.value{j + 1}", "m") for j in range(len(structure.nodes))]
+    return []
+
+
+def _lagrange_coefficients(nodes: Sequence[float], values: Sequence[Any]) -> list[Any]:
+    """Coefficients c2, c3, … of the polynomial w + c2 w² + … through (node, value) (Eq. 3.22).
+
+    Zero with slope one is fixed, so a degree of len(nodes) + 1 passes through all nodes.
+    """
+    x = np.asarray(nodes, dtype=float)
+    matrix = np.linalg.inv(np.stack([x ** (d + 2) for d in range(x.size)], axis=1))
+    excess = [v - xn for v, xn in zip(values, x.tolist(), strict=True)]
+    return [_sum(matrix[d, j] * excess[j] for j in range(x.size)) for d in range(x.size)]
+
+
+def _resonator(mode: Mode, s: Any) -> Any:
+    """b = s/(s² + 2ζωs + ω²) with its partial derivatives by s, ω and ζ."""
+    w = 2 * np.pi * mode.frequency_hz
+    z = mode.damping
+    sv, wv, zv = dual.value(s), dual.value(w), dual.value(z)
+    b = sv / (sv * sv + (2.0 * zv * wv) * sv + wv * wv)
+    if not (isinstance(s, Dual) or isinstance(w, Dual)):
+        return b
+    q = b * b / sv  # −∂b/∂(denominator)
+    return dual.chain(
+        b,
+        (b / sv - q * (2.0 * sv + 2.0 * zv * wv), s),
+        (-q * (2.0 * zv * sv + 2.0 * wv), w),
+        (-q * (2.0 * wv * sv), z),
+    )
+
+
+def _low_pass(top: Any, pole: Any, s: Any) -> Any:
+    """top/(s + pole) for a plain or Dual pole and a top of 1 or the pole itself."""
+    inverse = 1.0 / (dual.value(s) + dual.value(pole))
+    unit = dual.chain(inverse, (-inverse * inverse, s), (-inverse * inverse, pole))
+    return unit if top is None else unit * top
+
+
+def _sum(terms: Any) -> Any:
+    total: Any = 0.0
+    for t in terms:
+        total = total + t
+    return total

@@ -1,0 +1,70 @@
+"""What every test sees: the markers that name what a test needs, and what happens without it.
+
+``@pytest.mark.component("PortAudio")`` skips, naming the component and its install command, where
+the machine lacks it. With ``ENTRAIN_REQUIRE_COMPONENTS=1`` (as `.ci/run` sets it) the same test
+fails instead, so that nothing passes there by not having run.
+"""
+
+import ctypes.util
+import importlib.util
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+REQUIRE = "ENTRAIN_REQUIRE_COMPONENTS"
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+def _library(name: str) -> Callable[[], bool]:
+    return lambda: ctypes.util.find_library(name) is not None
+
+
+def _command(name: str) -> Callable[[], bool]:
+    return lambda: shutil.which(name) is not None
+
+
+def _module(name: str) -> Callable[[], bool]:
+    return lambda: importlib.util.find_spec(name) is not None
+
+
+def _chromium() -> bool:
+    return any(shutil.which(name) for name in ("chromium", "chromium-browser", "google-chrome"))
+
+
+# name -> (is it there?, how to get it)
+COMPONENTS: dict[str, tuple[Callable[[], bool], str]] = {
+    "PortAudio": (_library("portaudio"), "apt install libportaudio2"),
+    "PulseAudio": (
+        _command("pulseaudio"),
+        "apt install pulseaudio pulseaudio-utils libasound2-plugins",
+    ),
+    "JACK": (_command("jackd"), "apt install jackd2"),
+    "socat": (_command("socat"), "apt install socat"),
+    "openssl": (_command("openssl"), "apt install openssl"),
+    "Chromium": (_chromium, "apt install chromium"),
+    "pyvisa-sim": (_module("pyvisa_sim"), "pip install pyvisa-sim"),
+}
+
+
+def _missing(item: pytest.Item) -> str | None:
+    """What the machine lacks for this test; `None` when nothing."""
+    for mark in item.iter_markers("component"):
+        for name in mark.args:
+            present, remedy = COMPONENTS[name]
+            if not present():
+                return f"{name} not found: {remedy}"
+    return None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    missing = _missing(item)
+    if missing is not None:
+        if os.environ.get(REQUIRE) == "1":
+            pytest.fail(f"{missing} (required by {REQUIRE}=1)", pytrace=False)
+        pytest.skip(missing)
+    if item.get_closest_marker("shared") is not None and not SHARED.is_dir():
+        pytest.skip(f"recorded material not found: {SHARED}")

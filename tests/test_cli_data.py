@@ -1,0 +1,118 @@
+"""The command line on recorded data, keys and configuration, as a user calls it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.service_data import make_folder
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("COLUMNS", "200")
+    return tmp_path
+
+
+def entrain(capfd: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+    from daq.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main([str(word) for word in words])
+    captured = capfd.readouterr()
+    return int(ended.value.code or 0), captured.out, captured.err
+
+
+def test_import_list_show_rebuild(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    code, out, _ = entrain(capfd, "import", make_folder(home / "sines"))
+    assert code == 0
+    campaign = out.split()[1].rstrip(":")
+    assert "3 runs" in out
+    assert campaign in entrain(capfd, "campaign", "list")[1]
+    code, out, _ = entrain(capfd, "campaign", "show", campaign)
+    assert "validation" in out
+    assert entrain(capfd, "store", "rebuild")[0] == 0
+
+
+def test_import_of_a_single_recording(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    folder = make_folder(home / "sines")
+    channels = ("p1:pressure:Pa:0.01:0.7", "p2:pressure:Pa:0.01:0.8", "drive:voltage:V:1")
+    words = [word for text in channels for word in ("--channel", text)]
+    code, out, err = entrain(capfd, "import", folder / "free.wav", *words)
+    assert (code, err) == (0, "")
+    assert "1 runs" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("import", "/nowhere"), "/nowhere"),
+        (("campaign", "show", "nothing"), "nothing"),
+        (("keys", "create", "a", "--scope", "root"), "root"),
+        (("keys", "create", "a", "--expires", "soon"), "soon"),
+        (("keys", "revoke", "00000000"), "00000000"),
+        (("--config", "absent.toml", "config", "show"), "absent.toml"),
+        (("serve", "--host", "0.0.0.0"), "entrain keys create"),
+        (("serve", "--port", "99999999"), "port"),
+        (("nonsense",), "nonsense"),
+    ],
+)
+def test_what_is_not_possible_ends_with_one_line_and_2(
+    home: Path, capfd: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
+) -> None:
+    code, out, err = entrain(capfd, *words)
+    assert (code, out) == (2, "")
+    assert says in err
+    assert "Traceback" not in err
+
+
+def test_keys_are_shown_once_and_can_be_revoked(
+    home: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    code, text, _ = entrain(capfd, "keys", "create", "desk", "--scope", "control")
+    assert code == 0
+    identifier = text.split("_")[1]
+    code, out, _ = entrain(capfd, "keys", "list")
+    assert "active" in out
+    assert text.strip() not in out
+    assert entrain(capfd, "keys", "revoke", identifier)[0] == 0
+    assert "revoked" in entrain(capfd, "keys", "list")[1]
+
+
+def test_config_show_says_where_from(
+    home: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("ENTRAIN_SERVER__PORT", "9123")
+    code, out, _ = entrain(capfd, "config", "show", "--json")
+    assert code == 0
+    assert json.loads(out)["server.port"] == {
+        "value": 9123,
+        "source": "environment ENTRAIN_SERVER__PORT",
+    }
+
+
+def test_help_is_quick_and_loads_no_heavy_library() -> None:
+    heavy = ("numpy", "fastapi", "numba", "scipy")
+    code = f"import sys, daq.cli; print([m for m in {heavy} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_the_page_of_commands_is_theirs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command, option or setting without a line; README names every group."""
+    from daq.service.commands.document import page
+
+    root = Path(__file__).resolve().parents[1]
+    monkeypatch.setenv("COLUMNS", "40")  # however wide the terminal is
+    text = page()
+    assert (root / "docs" / "commands.md").read_text("utf-8") == text, (
+        "run: python -m daq.service.commands.document > docs/commands.md"
+    )
+    readme = (root / "README.md").read_text("utf-8")
+    first = {line.split()[2] for line in text.splitlines() if line.startswith("## entrain ")}
+    assert [name for name in sorted(first) if f"entrain {name}" not in readme] == []

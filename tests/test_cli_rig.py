@@ -1,0 +1,117 @@
+"""The command line on a simulated rig: dry run, campaign, resume, check, devices."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.test_cli_data import entrain, home  # noqa: F401  (a fixture)
+
+PLAN = """title = "quick"
+record_s = 0.5
+conditions = [{ offset = -0.02, over_threshold = 1.5 }, { offset = 0.02, amplitude_v = 1.0 }]
+"""
+
+
+@pytest.fixture
+def plan(home: Path) -> Path:  # noqa: F811
+    path = home / "plan.toml"
+    path.write_text(PLAN, encoding="utf-8")
+    return path
+
+
+def test_dry_run_moves_nothing_and_counts(plan: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    words = ("campaign", "dry-run", plan, "--free-hz", "170", "--json", "-")
+    code, out, err = entrain(capfd, *words)
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["runs"] == 3
+    # 166.6 Hz to the nearest multiple of 2 Hz, the spacing of a 0.5 s record's bins.
+    assert report["conditions"][1]["frequency_hz"] == 166.0
+    plan.write_text(PLAN.replace("1.0 }", "99.0 }"), encoding="utf-8")
+    code, _, err = entrain(capfd, "campaign", "dry-run", plan)
+    assert code == 2
+    assert "99" in err
+
+
+def test_campaign_run_list_and_show(plan: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    code, out, err = entrain(capfd, "campaign", "run", plan, "--seed", "3", "--json", "-")
+    assert (code, err) == (0, "")
+    result = json.loads(out)
+    assert result["status"] == "complete"
+    assert [o["status"] for o in result["outcomes"]] == ["success", "entrained", "entrained"]
+    # physics.md: 169.713 Hz; a free record of a second resolves a tenth of that spacing.
+    assert result["free"]["frequency_hz"] == pytest.approx(169.713, abs=0.1)
+    assert "complete" in entrain(capfd, "campaign", "list")[1]
+    code, out, _ = entrain(capfd, "campaign", "resume", result["campaign"], "--rig", "simulated")
+    assert code == 0
+    assert "complete" in out
+    assert entrain(capfd, "store", "verify")[0] == 0
+    code, out, _ = entrain(capfd, "store", "export", result["campaign"], plan.parent / "out.zip")
+    assert code == 0
+    assert (plan.parent / "out.zip").exists()
+
+
+def test_design_writes_a_plan_that_a_campaign_takes(
+    home: Path,  # noqa: F811
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    clean = Path(__file__).parent / "data" / "a-clean"
+    words = ("campaign", "design", clean, "--out", "best.json", "--runs", "3")
+    code, out, err = entrain(capfd, *words)
+    assert (code, err) == (0, "")
+    assert "3 conditions" in out
+    plan = json.loads((home / "best.json").read_text("utf-8"))
+    # recorded elsewhere: its cold runs, if any, are unknown to this store, and so is its rig
+    assert "continues" not in plan
+    assert (len(plan["conditions"]), plan["cold"]) == (3, [])
+    code, out, _ = entrain(capfd, "campaign", "dry-run", "best.json", "--json", "-")
+    assert code == 0
+    assert [row["kind"] for row in json.loads(out)["conditions"]] == ["free"] + 3 * ["forced"]
+
+
+def test_check_finds_the_simulated_rig_fit(
+    home: Path,  # noqa: F811
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    code, out, _ = entrain(capfd, "check")
+    assert code == 0
+    assert "silence" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("campaign", "run", "--rig", "none"), "none"),
+        (("campaign", "run", "absent.toml"), "absent.toml"),
+        (("campaign", "resume", "nothing"), "nothing"),
+        (("identify", "/nowhere"), "/nowhere"),
+        (("diagnose", "nothing"), "nothing"),
+        (("characterise", "absent.txt"), "absent.txt"),
+    ],
+)
+def test_what_is_not_possible_says_so(
+    home: Path,  # noqa: F811
+    capfd: pytest.CaptureFixture[str],
+    words: tuple[str, ...],
+    says: str,
+) -> None:
+    code, out, err = entrain(capfd, *words)
+    assert (code, out) == (2, "")
+    assert says in err
+    assert "Traceback" not in err
+
+
+def test_characterise_a_plain_sine(home: Path, capfd: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+    import numpy as np
+
+    time = np.arange(20_000) / 2000.0
+    noise = 0.01 * np.random.default_rng(1).standard_normal(time.size)
+    np.savetxt(home / "sine.txt", np.column_stack([time, np.sin(2 * np.pi * 100 * time) + noise]))
+    code, out, err = entrain(capfd, "characterise", home / "sine.txt", "--json", "-")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert found["format"] == "characterisation/1"
+    # Amplitude 1 at 100 Hz; noise of 0.01 over 20 000 samples leaves 1e-4 of uncertainty.
+    assert found["frequency_hz"]["value"] == pytest.approx(100.0, abs=1e-2)
+    assert found["amplitude"]["value"] == pytest.approx(1.0, abs=1e-2)

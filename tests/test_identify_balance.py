@@ -1,0 +1,101 @@
+"""Harmonic balance against the thesis's numbers, and its derivatives against differences."""
+
+import numpy as np
+import pytest
+
+from identify import balance
+from identify.structure import Conditions, Structure
+from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
+
+K = 7
+
+
+def theta(structure: Structure) -> np.ndarray:
+    values = true_values()
+    return structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+
+
+def forced_conditions() -> Conditions:
+    n = len(STEADY)
+    drive = np.zeros((n, K), dtype=complex)
+    drive[:, 0] = [-1j * row[1] for row in STEADY]  # F sin ωt
+    measured = np.zeros((n, K), dtype=complex)
+    measured[:, 0] = [row[2][0] * np.exp(1j * np.radians(row[3])) for row in STEADY]
+    return Conditions(
+        omega=2 * np.pi * np.array([row[0] for row in STEADY]),
+        drive=drive,
+        pressure=np.zeros_like(drive),
+        velocity=measured,
+        time=np.linspace(0, 1, n),
+        flame_on=np.ones(n),
+        identity=np.arange(n),
+    )
+
+
+def free_conditions() -> Conditions:
+    measured = np.zeros((1, K), dtype=complex)
+    measured[0, 0] = 2.3e6
+    nothing = np.zeros((1, K), dtype=complex)
+    return Conditions(
+        omega=2 * np.pi * np.array([169.0]),
+        drive=nothing,
+        pressure=nothing,
+        velocity=measured,
+        time=np.zeros(1),
+        flame_on=np.ones(1),
+        identity=np.arange(1),
+        free=True,
+    )
+
+
+def test_forced_orbits_are_the_thesis_steady_states() -> None:
+    structure = Structure()
+    orbits = balance.solve(structure, theta(structure), forced_conditions(), free=False)
+    assert orbits.converged.all()
+    expected = np.array([row[2] for row in STEADY])
+    # physics.md gives six digits: one unit of the last one
+    np.testing.assert_allclose(np.abs(orbits.velocity[:, :3]), expected, rtol=1e-5)
+    phases = np.degrees(np.angle(orbits.velocity[:, 0]))
+    np.testing.assert_allclose(phases, [row[3] for row in STEADY], atol=1e-3)
+
+
+def test_free_limit_cycle_is_the_thesis_one() -> None:
+    structure = Structure()
+    orbits = balance.solve(structure, theta(structure), free_conditions(), free=True)
+    assert orbits.converged.all()
+    assert orbits.omega[0] / (2 * np.pi) == pytest.approx(FREE_HZ, abs=5e-4)
+    np.testing.assert_allclose(np.abs(orbits.velocity[0, :3]), FREE_HARMONICS, rtol=3e-4)
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_derivatives_agree_with_differences(free: bool) -> None:
+    structure = Structure()
+    at = free_conditions() if free else forced_conditions()
+    t0 = theta(structure)
+    exact = balance.solve(structure, t0, at, free=free, derivatives=True)
+    assert exact.d_velocity is not None
+    for j in range(t0.size):
+        # a central difference errs by h²: 1e-10 relative here; rounding gives 1e-16/h = 1e-11
+        h = np.zeros_like(t0)
+        h[j] = 1e-5 * max(abs(t0[j]), 1e-7)
+        up = balance.solve(structure, t0 + h, at, free=free, start=exact.inputs)
+        down = balance.solve(structure, t0 - h, at, free=free, start=exact.inputs)
+        difference = (up.velocity - down.velocity) / (2 * h[j])
+        size = np.max(np.abs(difference)) + 1e-12 * np.max(np.abs(exact.velocity)) / abs(h[j])
+        error = np.max(np.abs(difference - exact.d_velocity[:, :, j]))
+        assert error < 2e-4 * size, structure.parameters.names[j]
+
+
+def test_several_vectors_at_once_equal_one_by_one() -> None:
+    structure = Structure()
+    at = forced_conditions()
+    vectors = theta(structure) * np.array([[1.0], [1.0001], [0.9999]])
+    together = balance.solve(structure, vectors, at, free=False, derivatives=True)
+    for i, vector in enumerate(vectors):
+        alone = balance.solve(structure, vector, at, free=False, derivatives=True)
+        part = together.take(np.arange(i * at.runs, (i + 1) * at.runs))
+        np.testing.assert_allclose(part.velocity, alone.velocity, rtol=1e-9)
+        assert part.d_velocity is not None
+        assert alone.d_velocity is not None
+        scale = np.max(np.abs(alone.d_velocity))
+        assert np.max(np.abs(part.d_velocity - alone.d_velocity)) < 1e-8 * scale

@@ -1,0 +1,118 @@
+"""The whole way from recordings to parameters, on data stepped by an independent integrator."""
+
+import numpy as np
+import pytest
+
+import identify
+from identify.harmonics import RecordError, fit_harmonics, measure, refine_frequency
+from identify.record import Campaign, Medium, Run, Signal
+from tests.identify_rig import true_values, velocity
+
+RATE = 5000.0
+CONDITIONS = ((164.0, 2.0e10), (166.0, 1.0e10), (168.0, 0.6e10), (171.0, 0.8e10), (174.0, 1.4e10),
+              (177.0, 2.0e10))  # fmt: skip
+
+
+def campaign(noise: float, seed: int = 1) -> Campaign:
+    """Forced runs of one second as a velocity channel, white noise of that share of 2.4e6."""
+    rng = np.random.default_rng(seed)
+    runs = []
+    for i, (f, a) in enumerate(CONDITIONS):
+        y = velocity(f, a, 1.0, RATE)
+        t = np.arange(y.size) / RATE
+        signals = {
+            "v": Signal(y + noise * 2.4e6 * rng.standard_normal(y.size), "velocity", "m/s"),
+            "drive": Signal(a * np.sin(2 * np.pi * f * t), "voltage", "V"),
+        }
+        role = "validation" if i == 2 else "fit"
+        runs.append(Run(f"r{i}", "forced", RATE, signals, f, a, 60.0 * i, role))
+    return Campaign("thesis", tuple(runs), Medium())
+
+
+@pytest.fixture(scope="module")
+def quiet() -> identify.Identification:
+    return identify.identify(campaign(noise=1e-5))
+
+
+def test_every_parameter_is_found_within_its_standard_error(quiet: identify.Identification) -> None:
+    fit = quiet.assessment.fit
+    assert fit.converged, fit.reason
+    truth = true_values()
+    for name, estimate in quiet.assessment.parameters.items():
+        # eleven parameters: 4.5 standard errors are passed by chance once in 13 000 campaigns
+        assert abs(estimate.value - truth[name]) < 4.5 * estimate.stderr, name
+    # what the data can tell at this noise is not little: the flame's gain to a per cent
+    gain = quiet.assessment.parameters["mode1.flame_residue"]
+    assert gain.stderr < 0.02 * gain.value
+
+
+def test_validation_error_is_at_the_noise_floor(quiet: identify.Identification) -> None:
+    a = quiet.assessment
+    # one run, three harmonics and more: |error|² over noise is χ² with some ten degrees of freedom,
+    # above four times its mean once in 10⁵
+    assert a.validation_error < 2 * a.noise_floor
+
+
+def test_model_has_its_own_limit_cycle(quiet: identify.Identification) -> None:
+    cycle = quiet.assessment.model_cycle
+    assert cycle is not None
+    assert cycle.frequency_hz == pytest.approx(
+        169.713, abs=max(5 * cycle.frequency_stderr_hz, 1e-3)
+    )
+    assert cycle.amplitude == pytest.approx(2.41447e6, abs=5 * cycle.amplitude_stderr)
+
+
+def test_json_follows_the_contract(quiet: identify.Identification) -> None:
+    told = quiet.to_json()
+    assert told["format"] == "identification/1"
+    assert told["converged"] is True
+    assert set(told["parameters"]["mode1.frequency_hz"]) == {"value", "stderr", "unit"}
+    for key in ("fit_error", "validation_error", "noise_floor", "chi2_per_dof", "dof", "seconds"):
+        assert isinstance(told[key], (int, float)), key
+    assert set(told["free_limit_cycle"]) == {"measured", "model"}
+
+
+def test_clean_data_show_no_discrepancy() -> None:
+    diagnosis = identify.diagnose(campaign(noise=3e-4, seed=5))
+    assert diagnosis.verdict == "no_discrepancy"
+    assert diagnosis.effects == ()
+
+
+def test_fourier_coefficients_of_an_incomplete_period() -> None:
+    # no noise: the least squares are exact to rounding wherever the record ends
+    t = np.arange(4321) / 10000.0
+    c = np.array([0.7 - 0.2j, 0.05 + 0.01j, 0.01j])
+    x = sum((ck * np.exp(2j * np.pi * 171.3 * k * t)).real for k, ck in enumerate(c, 1)) + 0.4
+    found, rest = fit_harmonics(x[None], 10000.0, 171.3, 3)
+    np.testing.assert_allclose(found[0], c, atol=1e-12)
+    assert np.max(np.abs(rest)) < 1e-11
+
+
+def test_frequency_estimate_reaches_the_cramer_rao_bound() -> None:
+    rng = np.random.default_rng(3)
+    n, rate, noise = 4000, 10000.0, 0.01
+    t = np.arange(n) / rate
+    errors = []
+    for _ in range(200):
+        x = np.cos(2 * np.pi * 169.7125 * t + 0.3) + noise * rng.standard_normal(n)
+        errors.append(refine_frequency(x, rate, 169.9) - 169.7125)
+    # var(ω) = 24 σ² / (A² n T²) for a real sine in white noise
+    bound = np.sqrt(24 * noise**2 / n) * rate / n / (2 * np.pi)
+    # the standard deviation of 200 draws is known to 5 %: three of that
+    assert np.std(errors) == pytest.approx(bound, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda s: {"v": s["v"]}, "drive"),
+        (lambda s: {**s, "drive": Signal(np.zeros(5000), "voltage", "V")}, "drive"),
+        (lambda s: {**s, "v": Signal(np.full(5000, np.nan), "velocity", "m/s")}, "not finite"),
+    ],
+)
+def test_unusable_recordings_are_refused_by_name(change, words) -> None:
+    run = campaign(noise=0.0).runs[0]
+    broken = Run("broken", "forced", RATE, change(dict(run.signals)), 164.0, 2e10)
+    with pytest.raises(RecordError, match=words) as refused:
+        measure(broken, Medium())
+    assert "broken" in str(refused.value)

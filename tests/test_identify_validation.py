@@ -1,0 +1,100 @@
+"""The fit judged by itself: residual tests, intervals, what is undetermined, uncertain drive."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drive import with_uncertain_drive
+from identify.fit import Fit, OrbitResidual, covariance_of, fit_orbits, levenberg_marquardt
+from identify.harmonics import VARIANCE_DOF
+from identify.identification import undetermined
+from identify.profile import intervals
+from identify.whiteness import residual_tests
+from tests.identify_coefficients import STRUCTURE, WIDE, clean, drawn, exact
+from tests.identify_rig import STEADY, true_values
+from tests.test_identify_balance import theta
+
+
+def test_residual_tests_have_the_false_alarm_rate_they_claim() -> None:
+    data, rng = clean(WIDE, 3e-4), np.random.default_rng(11)
+    found: dict[str, list[float]] = {}
+    for _ in range(60):
+        noisy = drawn(data, rng)
+        fit = fit_orbits(STRUCTURE, noisy, theta(STRUCTURE), continuation=(0.0,))
+        for t in residual_tests(fit, noisy):
+            found.setdefault(t.name, []).append(t.p_value)
+    assert set(found) == {"run_order", "harmonics", "amplitude", "frequency", "outlier"}
+    for name, p in found.items():
+        # at 20 % a binomial of 60 has a standard deviation of 5.2 %: three and a half of them
+        assert abs(np.mean(np.array(p) < 0.2) - 0.2) < 0.18, name
+
+
+def test_a_drift_is_seen_in_the_order_of_runs() -> None:
+    noisy = drawn(clean(WIDE, 3e-4), np.random.default_rng(2), drift=0.02)
+    fit = fit_orbits(STRUCTURE, noisy, theta(STRUCTURE), continuation=(0.0,))
+    tests = {t.name: t.p_value for t in residual_tests(fit, noisy)}
+    # seven runs less eleven parameters leave it little power: the null reaches 2.6 deviations
+    assert tests["run_order"] < 0.05, tests
+
+
+def test_intervals_are_profiled_where_the_likelihood_is_no_parabola() -> None:
+    few = tuple((f, a) for f, a, *_ in STEADY)
+    rng = np.random.default_rng(3)
+    quiet = drawn(clean(few, 1e-5), rng)
+    fit = fit_orbits(STRUCTURE, quiet, theta(STRUCTURE), continuation=(0.0,))
+    assert {i.method for i in intervals(fit, quiet).values()} == {"gaussian"}
+    loud = drawn(clean(few, 1.5e-3), rng)
+    fit = fit_orbits(STRUCTURE, loud, theta(STRUCTURE), continuation=(0.0,))
+    assert fit.converged
+    found = intervals(fit, loud)
+    name = "mode1.damping"
+    assert found[name].method == "profile"
+    # an end is where χ², minimised over all others, has risen by 1.96²; √Δχ² is met to 0.02
+    j = STRUCTURE.parameters.names.index(name)
+    for end in (found[name].lower, found[name].upper):
+        assert end is not None
+        low, high = STRUCTURE.parameters.bounds()
+        low[j] = high[j] = np.log(end)
+        (descent,) = levenberg_marquardt(
+            OrbitResidual(STRUCTURE, loud.fit), fit.theta[None], iterations=80, bounds=(low, high)
+        )
+        assert descent is not None
+        assert np.sqrt(descent.cost - fit.chi2) == pytest.approx(1.96, abs=0.03)
+
+
+def test_what_the_data_do_not_determine_is_named() -> None:
+    # one condition of eleven parameters' need: far too little
+    data = clean(WIDE[:2], 1e-3)
+    residual = OrbitResidual(STRUCTURE, data.fit)(theta(STRUCTURE)[None], np.zeros(1, int), True)
+    assert residual.jacobian is not None
+    J = residual.jacobian[0]
+    fit = Fit(STRUCTURE, theta(STRUCTURE), 0.0, 13, covariance_of(J), residual.residual[0], J,
+              True, "", 0)  # fmt: skip
+    said = undetermined(fit, data)
+    assert any("mode1.flame_residue" in s and "mode1.damping" in s for s in said), said
+    assert undetermined(exact(clean(WIDE, 1e-5)), clean(WIDE, 1e-5)) == ()
+    assert set(true_values()) == set(STRUCTURE.parameters.names)
+
+
+def test_an_uncertain_drive_is_part_of_the_covariance() -> None:
+    data, rng = clean(WIDE, 1e-4), np.random.default_rng(21)
+    (b,) = data.fit
+    variance = (4e-4 * np.abs(b.at.drive[:, 0])) ** 2  # E|n|², 2 to 12 times what the noise does
+    before, after = [], []
+    for _ in range(8):
+        (noisy,) = drawn(data, rng).fit
+        n = rng.standard_normal((2, *b.at.drive.shape)) * np.sqrt(variance / 2)[:, None]
+        wrong = b.at.drive + np.where(b.at.drive != 0, n[0] + 1j * n[1], 0.0)
+        told = replace(data, fit=(replace(
+            noisy, at=replace(b.at, drive=wrong), drive_noise=variance),))  # fmt: skip
+        fit = fit_orbits(STRUCTURE, told, theta(STRUCTURE), continuation=(0.0,))
+        wider = with_uncertain_drive(fit, told)
+        again = fit_orbits(STRUCTURE, wider, fit.theta, continuation=(0.0,))
+        before.append(fit.chi2_per_dof)
+        after.append(again.chi2_per_dof)
+    # χ² of 8 · 73 degrees of freedom: a standard deviation of 5.9 % (weights estimated: some more)
+    assert np.mean(before) > 2
+    assert np.mean(after) == pytest.approx(VARIANCE_DOF / (VARIANCE_DOF - 2), abs=0.2)
+    quiet = replace(data, fit=(replace(b, drive_noise=variance * 1e-6),))
+    assert with_uncertain_drive(fit, quiet) is quiet

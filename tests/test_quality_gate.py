@@ -1,0 +1,369 @@
+"""The data quality gate: silent on clean recordings, and every defect named where it is.
+
+Sizes that must be found follow from the noise of the material (0.3 Pa a microphone beside 340 Pa
+and more, rumble of some Pa below 60 Hz); sizes beneath are tested to harm nobody.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identify.quality import Quality, inspect
+from identify.record import Campaign, Signal
+from tests.quality_material import (
+    FREE_HZ,
+    FREE_PA,
+    Edit,
+    campaign_of,
+    clip,
+    drop,
+    edited,
+    hold,
+    line,
+    one,
+    pressures,
+    repeat,
+    run_of,
+    transient,
+)
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(scope="module")
+def clean() -> Campaign:
+    return campaign_of(1)
+
+
+def judged(campaign: Campaign, edit: Edit, number: int = 3) -> tuple[Quality, dict[str, str], str]:
+    """The verdict on run `number` with the edit: all, its flags with severities, its name; the
+    other runs must be free of flags."""
+    found = inspect(edited(campaign, edit, number))
+    name = campaign.runs[number].name
+    assert {f.run for f in found.flags} <= {name}
+    return found, {f.flag: f.severity for f in found.flags}, name
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_clean_recordings_raise_nothing(seed: int) -> None:
+    assert inspect(campaign_of(100 + seed)) == Quality((), frozenset(), ())
+
+
+@pytest.mark.parametrize("seconds", [1.0, 3.0])
+def test_clean_recordings_of_other_lengths_raise_nothing(seconds: float) -> None:
+    assert inspect(campaign_of(7, seconds)) == Quality((), frozenset(), ())
+
+
+def test_noise_free_commensurate_recordings_raise_nothing(clean: Campaign) -> None:
+    """200 Hz at 10 kHz: fifty values over and over, exact repeats and equal tops by right."""
+    t = np.arange(20000) / 10000
+    y = 800 * np.cos(2 * np.pi * 200 * t + 0.3)
+    run = clean.runs[1]
+    signals = {
+        "p1": replace(run.signals["p1"], values=np.round(y / 0.15) * 0.15),
+        "p2": replace(run.signals["p2"], values=np.round(1.05 * y / 0.15) * 0.15),
+        "drive": replace(run.signals["drive"], values=np.sin(2 * np.pi * 200 * t)),
+    }
+    odd = replace(run, name="200Hz", signals=signals, frequency_hz=200.0, amplitude_v=1.0)
+    found = inspect(replace(clean, runs=(*clean.runs, odd)))
+    assert [f for f in found.flags if f.run == "200Hz"] == []
+
+
+@pytest.mark.shared
+@pytest.mark.parametrize(
+    "case",
+    [
+        "a-clean",
+        "b-flame-delay",
+        "c-speaker-resonance",
+        "d-extra-mode",
+        "e-mic-skew",
+        "f-drift",
+    ],
+)
+def test_shared_recordings_raise_nothing(case: str) -> None:
+    assert inspect(shared_case(case)) == Quality((), frozenset(), ())
+
+
+def shared_case(case: str) -> Campaign:
+    """A campaign folder of int16 recordings, read without the project's importers."""
+    import tomllib
+
+    from scipy.io import wavfile
+
+    from identify.record import Medium, Run
+
+    folder = SHARED / "cases" / case
+    card = tomllib.loads((folder / "campaign.toml").read_text())
+    runs = []
+    for r in card["runs"]:
+        rate, x = wavfile.read(folder / r["file"])
+        signals = {}
+        for j, c in enumerate(card["channels"]):
+            full = c["full_scale_v"] / c["volts_per_unit"]
+            signals[c["name"]] = Signal(
+                x[:, j] * (full / 32768),
+                c["quantity"],
+                c["unit"],
+                c.get("position_m"),
+                full,
+                full / 32768,
+            )
+        asked = r.get("frequency_hz"), r.get("amplitude_v")
+        runs.append(Run(r["file"], r["kind"], rate, signals, *asked, r["started_s"]))
+    return Campaign(case, tuple(runs), Medium(**card["medium"]))
+
+
+@pytest.mark.parametrize("share", [0.9, 0.95, 0.99, 0.995])
+def test_flat_tops_are_clipping(clean: Campaign, share: float) -> None:
+    """Even 0.5 % of the peak cut costs (2/3π)(0.1 rad)³ = 2e-4 of a pressure, twenty times that of
+    the two pressures' difference."""
+    _, flags, _ = judged(clean, clip(share))
+    assert flags == {"clipped": "excluded"}
+
+
+def test_full_scale_is_clipping(clean: Campaign) -> None:
+    """The converter's end, 5000 Pa, a little below the signal's peak."""
+    run = clean.runs[3]
+    p1 = run.signals["p1"]
+    limit = 0.97 * float(np.abs(p1.values).max())
+    signal = replace(p1, values=np.clip(p1.values, -limit, limit), full_scale=limit)
+    runs = list(clean.runs)
+    runs[3] = replace(run, signals={**run.signals, "p1": signal})
+    found = inspect(replace(clean, runs=tuple(runs)))
+    assert [(f.run, f.flag) for f in found.flags] == [(run.name, "clipped")]
+    assert "full scale" in found.flags[0].detail
+    assert found.excluded == {run.name}
+
+
+@pytest.mark.parametrize("channel", ["p1", "p2", "drive"])
+def test_dead_channels_exclude(clean: Campaign, channel: str) -> None:
+    _, flags, _ = judged(clean, one(channel, lambda x, t: 0 * x + 1.0))
+    assert flags == {"dead_channel": "excluded"}
+
+
+def test_missing_and_broken_channels_exclude(clean: Campaign) -> None:
+    def wreck(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        x[17] = np.nan
+        return x
+
+    assert judged(clean, one("p1", wreck))[1] == {"not_finite": "excluded"}
+    runs = list(clean.runs)
+    signals = dict(runs[2].signals)
+    del signals["drive"]
+    runs[2] = replace(runs[2], signals=signals)
+    runs[4] = replace(runs[4], exit_status="aborted")
+    found = inspect(replace(clean, runs=tuple(runs)))
+    assert [f.flag for f in found.flags] == ["missing_channel", "not_completed"]
+    assert found.excluded == {runs[2].name, runs[4].name}
+
+
+@pytest.mark.parametrize("number", [0, 3])
+@pytest.mark.parametrize("samples", [1, 5, 50])
+def test_lost_samples_are_found(clean: Campaign, samples: int, number: int) -> None:
+    """One sample is 2π·168/10000 = 0.106 rad of phase; the pressure's noise per period, over three
+    periods, some 1e-3 rad. Free runs have only the pressures to tell by."""
+    found, flags, name = judged(clean, drop(samples), number)
+    assert flags == {"dropped_samples": "excluded"}
+    assert found.excluded == {name}
+
+
+def test_gaps_noted_by_the_acquisition_exclude(clean: Campaign) -> None:
+    runs = list(clean.runs)
+    runs[2] = replace(runs[2], notes={"gaps": [[500, 64]]})
+    found = inspect(replace(clean, runs=tuple(runs)))
+    assert [(f.flag, f.severity) for f in found.flags] == [("dropped_samples", "excluded")]
+
+
+@pytest.mark.parametrize("samples", [16, 64, 256])
+def test_repeated_buffers_are_found(clean: Campaign, samples: int) -> None:
+    found, flags, name = judged(clean, repeat(samples))
+    assert flags.keys() <= {"repeated_samples", "dropped_samples"}
+    assert found.excluded == {name}
+
+
+@pytest.mark.parametrize(("samples", "severity"), [(6, "down_weighted"), (40, "excluded")])
+def test_held_samples_are_found(clean: Campaign, samples: int, severity: str) -> None:
+    assert judged(clean, hold(samples))[1] == {"repeated_samples": severity}
+
+
+@pytest.mark.parametrize(
+    ("db", "severity"),
+    [(-6, "excluded"), (-10, "excluded"), (-18, "excluded"), (-25, "down_weighted"), (-45, None)],
+)
+def test_side_lines_near_the_free_frequency(
+    clean: Campaign, db: float, severity: str | None
+) -> None:
+    """Twenty decibels below the free run's level is the thesis's limit."""
+    _, flags, _ = judged(clean, line(FREE_HZ, FREE_PA * 10 ** (db / 20), 1.047), 4)
+    assert flags == ({} if severity is None else {"incompletely_entrained": severity})
+
+
+def test_a_run_that_does_not_lock(clean: Campaign) -> None:
+    """The free cycle goes on beside a weak forced response."""
+
+    def change(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return 0.2 * x + FREE_PA * np.cos(2 * np.pi * FREE_HZ * t)
+
+    found, flags, name = judged(clean, pressures(change))
+    assert flags == {"not_entrained": "excluded"}
+    assert found.excluded == {name}
+
+
+@pytest.mark.parametrize(
+    ("size", "seconds", "severity"),
+    [
+        (1e-3, 0.2, None),
+        (1e-2, 0.6, "excluded"),
+        (3e-2, 0.2, "excluded"),
+        (1e-1, 0.2, "excluded"),
+    ],
+)
+def test_settling_runs(clean: Campaign, size: float, seconds: float, severity: str | None) -> None:
+    """A decay shifts the coefficient by size·τ/T: 1e-4 (harmless), 3e-3, 3e-3 and 1e-2."""
+    _, flags, _ = judged(clean, transient(size, seconds))
+    assert flags == ({} if severity is None else {"unsettled": severity})
+
+
+def test_a_slow_drift_excludes_nothing(clean: Campaign) -> None:
+    """A per cent in the run: the mean is that of its middle. 0.6 % in 1200 s is not even seen."""
+    found, flags, _ = judged(clean, pressures(lambda x, t: x * (1 + 0.005 * t)))
+    assert flags == {"drift_inside_run": "down_weighted"}
+    assert not found.excluded
+    slow = edited(clean, pressures(lambda x, t: x * (1 + 5e-6 * t)))
+    assert inspect(slow) == Quality((), frozenset(), ())
+
+
+@pytest.mark.parametrize(
+    ("frequency", "flag"), [(50.0, "mains_hum"), (180.0, "mains_hum"), (433.3, "foreign_tone")]
+)
+def test_a_tone_in_every_run_is_interference(clean: Campaign, frequency: float, flag: str) -> None:
+    """Amplitude of the velocity: (1 − 0.7)·p/(ρ Δx ω), Eq. 5.2; noise 0.02 Pa a bin and channel
+    (white) or 0.1 (rumble) against 2 Pa: 5 % of it."""
+    pascal = 2.0
+    found = inspect(edited(clean, line(frequency, pascal)))
+    assert not found.excluded
+    assert [t.frequency_hz for t in found.tones] == [pytest.approx(frequency, abs=0.1)]
+    tone = found.tones[0]
+    expected = 0.3 * pascal / (1.2 * 0.0508 * 2 * np.pi * frequency)
+    assert tone.amplitude == pytest.approx(expected, rel=0.05)
+    assert tone.unit == "m/s"
+    assert tone.p_value < 1e-6
+    assert {f.flag for f in found.flags} == {flag}
+    assert {f.severity for f in found.flags} == {"noted"}
+    assert {f.run for f in found.flags} == set(tone.runs)
+    assert len(tone.runs) >= 4
+
+
+def test_a_tone_in_one_run_is_no_interference(clean: Campaign) -> None:
+    found, flags, _ = judged(clean, line(433.3, 2.0))
+    assert flags == {"foreign_tone": "noted"}
+    assert found.tones == ()
+
+
+def test_beating_in_several_runs_is_no_interference(clean: Campaign) -> None:
+    """The free cycle's line and its combinations with the drive's, at the same place in all."""
+
+    def beat(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        free = 2 * np.pi * FREE_HZ * t
+        return x + 30 * np.cos(free) + 2 * np.cos(2 * free) + np.cos(3 * free)
+
+    found = inspect(edited(clean, pressures(beat), 1, 2, 3, 4, 5, 6))
+    assert found.tones == ()
+
+
+def test_another_mode_that_sings_beside_the_forcing(clean: Campaign) -> None:
+    """A far line with its combinations excludes; the same line without them is only a tone."""
+    drive = clean.runs[3].frequency_hz
+    assert drive is not None
+    mixed = ((263.3, 100.0), (263.3 - drive, 10.0), (263.3 + drive, 10.0))
+
+    def sing(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return x + sum(a * np.cos(2 * np.pi * f * t) for f, a in mixed)
+
+    _, flags, _ = judged(clean, pressures(sing))
+    assert flags["another_oscillation"] == "excluded"
+    _, flags, _ = judged(clean, line(263.3, 100.0))
+    assert "another_oscillation" not in flags
+
+
+def test_modulated_runs_are_quasi_periodic(clean: Campaign) -> None:
+    def modulate(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return x * (1 + 0.3 * np.cos(2 * np.pi * 23.7 * t))
+
+    _, flags, _ = judged(clean, pressures(modulate))
+    assert flags["quasi_periodic"] == "excluded"
+
+
+@pytest.mark.parametrize("channel", ["p1", "p2"])
+def test_an_inverted_microphone(clean: Campaign, channel: str) -> None:
+    assert judged(clean, one(channel, lambda x, t: -x))[1] == {"inverted_channel": "excluded"}
+
+
+def test_an_inverted_drive(clean: Campaign) -> None:
+    """Told from three like runs: those whose forcing is on the same side of the free frequency."""
+    rng = np.random.default_rng(8)
+    more = (run_of("165Hz", 165.0, 1.8, rng), run_of("163Hz", 163.0, 2.2, rng))
+    campaign = replace(clean, runs=(*clean.runs, *more))
+    assert inspect(campaign) == Quality((), frozenset(), ())
+    assert judged(campaign, one("drive", lambda x, t: -x), 2)[1] == {"inverted_channel": "excluded"}
+
+
+def test_every_microphone_inverted(clean: Campaign) -> None:
+    found = inspect(edited(clean, one("p2", lambda x, t: -x)))
+    assert found.excluded == {r.name for r in clean.runs}
+
+
+def test_exchanged_microphones(clean: Campaign) -> None:
+    runs = list(clean.runs)
+    s = runs[3].signals
+    swapped = {
+        "p1": replace(s["p1"], values=s["p2"].values),
+        "p2": replace(s["p2"], values=s["p1"].values),
+    }
+    runs[3] = replace(runs[3], signals={**s, **swapped})
+    found = inspect(replace(clean, runs=tuple(runs)))
+    assert [(f.run, f.flag) for f in found.flags] == [(runs[3].name, "swapped_channels")]
+
+
+def test_frequency_and_amplitude_that_were_not_asked_for(clean: Campaign) -> None:
+    runs = list(clean.runs)
+    runs[2] = replace(runs[2], frequency_hz=166.02)  # the drive is at 166
+    runs[3] = replace(runs[3], amplitude_v=0.63)  # it has 0.6 V
+    runs[4] = replace(runs[4], frequency_hz=181.0)  # it is at 171
+    found = inspect(replace(clean, runs=tuple(runs)))
+    assert [(f.run, f.flag, f.severity) for f in found.flags] == [
+        (runs[2].name, "frequency_off_bin", "noted"),
+        (runs[3].name, "drive_amplitude", "noted"),
+        (runs[4].name, "frequency_off_bin", "excluded"),
+    ]
+
+
+def test_free_runs_that_are_none(clean: Campaign) -> None:
+    """The generator left on; and a rig that does not oscillate."""
+    on = one("drive", lambda x, t: x + np.sin(2 * np.pi * 168 * t))
+    assert judged(clean, on, 0)[1] == {"drive_in_free_run": "excluded"}
+    rng = np.random.default_rng(5)
+    noise = pressures(lambda x, t: 3.0 * rng.standard_normal(x.size))
+    assert judged(clean, noise, 0)[1] == {"no_limit_cycle": "excluded"}
+
+
+def test_noise_at_low_frequency(clean: Campaign) -> None:
+    rng = np.random.default_rng(6)
+    wind = 2.0 * np.cumsum(rng.standard_normal(20000))
+    wind -= np.linspace(wind[0], wind[-1], wind.size)
+    _, flags, _ = judged(clean, pressures(lambda x, t: x + wind))
+    assert flags["excess_low_frequency"] == "noted"
+
+
+def test_records_that_are_too_short(clean: Campaign) -> None:
+    brief = edited(clean, lambda name, x, t: x[:250], 3)
+    assert "too_short" in {f.flag for f in inspect(brief).flags if f.severity == "excluded"}
+
+
+def test_details_say_what_to_do(clean: Campaign) -> None:
+    found, _, _ = judged(clean, clip(0.95))
+    assert "p2" in found.flags[0].detail
+    assert "record again" in found.flags[0].detail

@@ -1,0 +1,196 @@
+"""Effects that need more than one fit: spreads, gross ones, shapes that nobody knows."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import identify
+from daq.importers import open_campaign
+from identify import assess, balance, start, trace
+from identify.effects import CATALOGUE, by_key
+from identify.effects.scatter import SCATTERS
+from identify.executor import InProcess
+from identify.fit import Fit
+from identify.identification import Prepared, prepare
+from identify.load import load_campaign
+from identify.record import Campaign
+from identify.scatter import fit_scatter
+from simulated_rig.campaigns import simulate_campaign, write_campaign
+from simulated_rig.effects import make_effect
+from simulated_rig.random_rigs import random_campaign, random_rig
+
+pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
+
+DRIVE = next(s for s in SCATTERS if s.name == "drive_scatter")
+FLAME = next(s for s in SCATTERS if s.name == "flame_gain_modulation")
+
+
+def campaign(
+    folder: Path,
+    seed: int,
+    key: str,
+    drive_noise_v: float = 0.0,
+    noise_db: float = 60.0,
+    **parameters: float,
+) -> Campaign:
+    """A random two-mode rig with one effect: its campaign as read from disk."""
+    rig = random_rig(seed, noise_db=noise_db, modes=(2,))
+    effects = [make_effect(key, parameters)] if key else []
+    rig, plan = random_campaign(seed, rig, effects, forced=9, validation=2)
+    rig = replace(rig, converter=replace(rig.converter, drive_noise_v=drive_noise_v))
+    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
+    return load_campaign(open_campaign(folder))
+
+
+def recorded(folder: Path, seed: int, key: str, **parameters: float) -> tuple[Prepared, Fit]:
+    """Such a campaign prepared, and the declared fit."""
+    ready = prepare(campaign(folder, seed, key, **parameters))
+    return ready, start.fit_from_data(ready.structure, ready.data)
+
+
+def only(ready: Prepared, base: Fit, key: str) -> trace.Tried:
+    """The best fit with that effect and no other tried."""
+    found = trace.try_effects(
+        ready.structure, ready.data, base, [by_key(key)], executor=InProcess(), keep=1,
+        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
+    )  # fmt: skip
+    return trace.started_again(found, ready.data, InProcess())[0]
+
+
+def deviance(ready: Prepared, base: Fit, name: str) -> float:
+    (scatter,) = [s for s in SCATTERS if s.name == name]
+    spread = fit_scatter(ready.structure, ready.data, base, scatter)
+    return np.inf if spread is None else spread.fit.chi2 + spread.penalty
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("drive_scatter", {"gain_rms": 0.004, "phase_rms_rad": 0.004}),
+        ("flame_gain_modulation", {"modulation_rms": 0.01, "corner_hz": 0.5}),
+    ],
+)
+def test_a_spread_from_run_to_run_is_told_by_its_direction(
+    tmp_path: Path, name: str, truth: dict[str, float]
+) -> None:
+    ready, base = recorded(tmp_path, 3, name, **truth)
+    assert assess.lack_of_fit_p(base.chi2, base.dof) < 1e-6
+    (scatter,) = [s for s in SCATTERS if s.name == name]
+    spread = fit_scatter(ready.structure, ready.data, base, scatter)
+    assert spread is not None
+    assert spread.objection == ""
+    assert assess.lack_of_fit_p(spread.fit.chi2, spread.fit.dof) > 1e-3
+    other = "flame_gain_modulation" if name == "drive_scatter" else "drive_scatter"
+    mine = spread.fit.chi2 + spread.penalty
+    assert mine + trace.EVIDENCE < deviance(ready, base, other)
+    if name == "drive_scatter":
+        size = spread.sizes["drive_scatter.gain_rms"]
+        assert abs(np.log(size.value / 0.004)) < 3 * size.stderr / size.value
+
+
+def test_what_follows_the_drive_is_no_chance(tmp_path: Path) -> None:
+    """A compressing speaker deviates along the drive, run by run, but by a law."""
+    ready, base = recorded(tmp_path, 3, "actuator_nonlinearity", cubic_per_v2=-0.01)
+    spread = fit_scatter(ready.structure, ready.data, base, DRIVE)
+    assert spread is None or spread.objection != ""
+    law = only(ready, base, "actuator_nonlinearity:cubic")
+    assert law.adequate
+
+
+def test_the_velocity_of_another_place_in_modes_of_unknown_shape(tmp_path: Path) -> None:
+    ready, base = recorded(tmp_path, 17, "sensor_offset", offset_m=-0.008)
+    assert base.chi2_per_dof > 10
+    assert only(ready, base, "sensor_offset:modal_2").adequate
+
+
+def test_an_amplifier_at_its_rails(tmp_path: Path) -> None:
+    ready, base = recorded(tmp_path, 29, "actuator_nonlinearity", clip_v=1.1)
+    assert base.chi2_per_dof > trace.GROSS
+    found = only(ready, base, "actuator_nonlinearity:knee")
+    assert found.adequate
+    level = found.estimates["actuator_nonlinearity.level_v"]
+    assert abs(level.value - 1.1) < 3 * level.stderr
+
+
+def test_data_corrected_for_a_known_effect_need_it_no_more(tmp_path: Path) -> None:
+    """The drive of a resonant speaker, filtered by the resonance, fits the declared model."""
+    truth = {"resonance_hz": 150.0, "damping": 0.3}
+    ready, base = recorded(tmp_path, 3, "actuator_dynamics", **truth)
+    assert base.chi2_per_dof > trace.GROSS
+    values = {"actuator_dynamics.frequency_hz": 150.0, "actuator_dynamics.damping": 0.3}
+    effect = by_key("actuator_dynamics:resonance")
+    clean = start.corrected(ready.data, [effect], values)
+    assert clean is not None
+    assert start.fit_from_data(ready.structure, clean).chi2_per_dof < 2
+    nowhere = dict.fromkeys(values, np.inf)
+    assert start.corrected(ready.data, [effect], nowhere) is None
+
+
+def test_many_tests_count_as_many_as_they_are() -> None:
+    """Twenty unrelated tests are twenty, one test twenty times is one (sampling: 4 standard
+    errors of 20 000 draws)."""
+    axes = np.linalg.qr(np.random.default_rng(1).standard_normal((60, 20)))[0]
+    least = 0.004
+    unrelated = [trace.ScoreTest(8.3, axes[0], 1.0, least, axis[:, None]) for axis in axes.T]
+    assert trace.family_p(unrelated) == pytest.approx(1 - (1 - least) ** 20, abs=0.008)
+    assert trace.family_p(unrelated[:1] * 20) == pytest.approx(least, abs=0.002)
+    sure = replace(unrelated[0], p_value=1e-9)
+    assert trace.family_p([sure, *unrelated]) == pytest.approx(21e-9)
+
+
+@pytest.mark.parametrize(
+    ("form", "key", "truth"),
+    [
+        ("hysteresis", "nonlinearity_shape", {"hysteresis_width": 0.01}),
+        ("dead_zone", "nonlinearity_shape", {"dead_zone_width": 0.01}),
+        ("quadratic_end", "nonlinear_damping", {"quadratic_per_m": 5.0}),
+    ],
+)
+def test_laws_with_corners_and_losses_elsewhere(
+    tmp_path: Path, form: str, key: str, truth: dict[str, float]
+) -> None:
+    # 40 dB: at 60 dB one sees the simulated pressure's own jumps, sampled at 640 kHz
+    ready, base = recorded(tmp_path, 3, key, noise_db=40.0, **truth)
+    assert assess.lack_of_fit_p(base.chi2, base.dof) < 1e-6
+    effects = [e for e in CATALOGUE if e.key == f"{key}:{form}"]
+    (effect,) = [e for e in effects if trace.usable(e, ready.data, ready.structure)]
+    found = trace.try_effects(
+        ready.structure, ready.data, base, [effect], executor=InProcess(), keep=1,
+        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
+    )  # fmt: skip
+    assert found[0].adequate
+
+
+@pytest.mark.parametrize("form", ["hysteresis", "dead_zone"])
+def test_derivatives_through_corners(tmp_path: Path, form: str) -> None:
+    """The balance's derivative by the width against differences of solved orbits."""
+    ready, base = recorded(tmp_path, 3, "")
+    effect = by_key(f"nonlinearity_shape:{form}")
+    width = effect.parameters[0]
+    known = trace.known_sizes(ready.data, base)
+    structure = ready.structure.with_effects(effect)
+    theta = np.r_[base.theta, width.to_internal(0.05 * known.flame_input_amplitude)]
+    at = ready.data.fit[0].at
+    h = 1e-4 * np.eye(theta.size)[-1]
+    exact = balance.solve(structure, theta, at, free=False, derivatives=True)
+    up, down = (balance.solve(structure, theta + q, at, free=False).velocity for q in (h, -h))
+    assert exact.converged.all()
+    assert exact.d_velocity is not None
+    difference = (up - down) / 2e-4
+    error = np.abs(exact.d_velocity[..., -1] - difference).max()
+    assert error < 2e-3 * np.abs(difference).max()  # the corners' places are sampled
+
+
+def test_a_noisy_record_of_the_drive_is_no_discovery(tmp_path: Path) -> None:
+    """Noise of 0.1 V on the recorded drive: far above what the velocity's own noise explains."""
+    clean = campaign(tmp_path / "clean", 2, "", drive_noise_v=0.1)
+    assert identify.diagnose(clean).verdict == "no_discrepancy"
+    late = campaign(tmp_path / "late", 2, "flame_delay", drive_noise_v=0.1, delay_s=6e-4)
+    found = identify.diagnose(late)
+    assert [e.effect for e in found.effects] == ["flame_delay"]
+    # where nothing explains the data the best fit passes the noise on, in place of the declared one
+    poor = identify.diagnose(late, catalogue=[by_key("channel_mismatch:phase")])
+    assert poor.verdict == "unexplained"
+    assert poor.noise_floor == pytest.approx(found.noise_floor, rel=0.1)
