@@ -13,7 +13,7 @@ Derivatives come from the implicit function theorem, ∂x/∂θ = −R_x⁻¹ R_
 differentiation of the assembled equations: exact, and the solver itself is never differenced.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -23,14 +23,17 @@ import numpy.typing as npt
 
 from identify import dual
 from identify.dual import Dual
+from identify.newton import newton, slopes
+from identify.polynomial import Polynomial
 from identify.structure import Characteristic, Conditions, Loop, Preceded, Structure, Values
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
+IntArray = npt.NDArray[np.int64]
 
 TOLERANCE = 1e-10  # relative Newton residual: far below any noise, above rounding
-MAX_ITERATIONS = 12
+MAX_ITERATIONS = 12  # Newton steps; twice as many where ω is an unknown too
 FINE = 512  # samples a period of a `Preceded` characteristic: turning points to 2e-5 of the swing
 
 
@@ -43,6 +46,14 @@ def _period(harmonics: int, samples: int | None = None) -> tuple[FloatArray, Com
     to_time = np.hstack([np.cos(angle), -np.sin(angle)])
     to_harmonics = (2.0 / samples) * np.exp(-1j * angle.T)
     return to_time, to_harmonics
+
+
+@lru_cache(maxsize=32)
+def _waves(harmonics: int) -> tuple[FloatArray, FloatArray]:
+    """cos mτ and sin mτ, m = 0 … 2K, at the same time samples: (2K + 1, T) each."""
+    samples = _period(harmonics)[0].shape[0]
+    angle = 2 * np.pi * np.outer(np.arange(2 * harmonics + 1), np.arange(samples)) / samples
+    return np.cos(angle), np.sin(angle)
 
 
 def to_time(c: Any, harmonics: int, samples: int | None = None) -> Any:
@@ -105,7 +116,7 @@ def solve(
     start: ComplexArray | None = None,
     start_omega: FloatArray | None = None,
     derivatives: bool = False,
-    iterations: int = MAX_ITERATIONS,
+    iterations: int | None = None,
 ) -> Orbits:
     """Steady states of one batch, all forced (or cold), or all free.
 
@@ -117,21 +128,22 @@ def solve(
     start : nonlinearity inputs to start from, (loops, rows, K); default: from the measured
         velocity. A row that does not converge from `start` is tried from the measurement too.
     start_omega : where the search for ω starts instead, (rows,).
-    iterations : at most that many Newton steps. Few of them give an approximate orbit, marked
-        as not converged, for a search that is still far from any solution.
+    iterations : at most that many Newton steps (default `MAX_ITERATIONS`). Few of them give an
+        approximate orbit, marked as not converged, for a search still far from any solution.
     """
+    limit = iterations or MAX_ITERATIONS * (2 if free else 1)
     vectors = theta[None] if theta.ndim == 1 else theta
     rows = at.tile(vectors.shape[0])
     values = structure.parameters.plain(vectors, at.runs)
     begin = rows if start_omega is None else replace(rows, omega=start_omega)
     first = _inputs_from_velocity(structure, values, rows) if start is None else start
-    orbits = _newton(structure, values, begin, first, free, iterations)
+    orbits = _newton(structure, values, begin, first, free, limit)
     if start is not None and not orbits.converged.all():
         again = np.flatnonzero(~orbits.converged)
         some = {n: v[again] for n, v in values.items()}
         fewer = rows.take(again)
         measured = _inputs_from_velocity(structure, some, fewer)
-        orbits = _merge(orbits, _newton(structure, some, fewer, measured, free, iterations), again)
+        orbits = _merge(orbits, _newton(structure, some, fewer, measured, free, limit), again)
     return differentiate(structure, vectors, at, orbits, free=free) if derivatives else orbits
 
 
@@ -156,54 +168,117 @@ def _newton(
     structure: Structure, p: Values, at: Conditions, start: ComplexArray, free: bool, limit: int
 ) -> Orbits:
     K = at.harmonics
-    k = np.arange(1, K + 1)
-    v = start.copy()
-    omega = at.omega.copy()
+    v, omega, left = start.copy(), at.omega.copy(), np.full(at.runs, limit)
     if free:
-        turn = np.exp(-1j * np.angle(v[0, :, :1]) * k)
-        v = v * turn
-    loop = structure.assemble(p, at, 1j * omega[:, None] * k)
-    error = np.full(at.runs, np.inf)
+        v = v * np.exp(-1j * np.angle(v[0, :, :1]) * np.arange(1, K + 1))
     with np.errstate(all="ignore"):
-        for _ in range(limit):
-            if free:
-                loop = structure.assemble(p, at, 1j * omega[:, None] * k)
-            R = np.stack(_residual(loop, v, K))
-            size = np.sqrt(np.sum(np.abs(v) ** 2, axis=2)) + 1e-300
-            error = np.max(np.sqrt(np.sum(np.abs(R) ** 2, axis=2)) / size, axis=0)
-            error = np.where(np.isfinite(error), error, np.inf)
-            if np.all((error < TOLERANCE) | ~np.isfinite(error)):
+        while True:
+            loop, terms = _assembled(structure, p, at, omega, free, len(v))
+            if all(isinstance(n, Polynomial) for n in loop.N):
+                curves = _tables(loop.N, at.runs)
+                cosines, sines = _waves(K)
+                error, taken, forces = newton(
+                    *terms, curves, v, omega, cosines, sines, free, left, TOLERANCE
+                )
+            else:
+                v, omega, error, taken, forces = _sampled_newton(
+                    loop.N, terms, v, omega, free, left
+                )
+            left = left - taken
+            if not free or not taken.any():  # solved where it was assembled
                 break
-            slopes = [_force_jacobian(n, x, K) for n, x in zip(loop.N, v, strict=True)]
-            J = _jacobian(loop, slopes, K)
-            if free:  # the column of Im v_0,1, which stays 0, becomes ω's
-                nudge = 1e-7 * omega
-                moved = structure.assemble(p, at, 1j * (omega + nudge)[:, None] * k)
-                ahead = np.stack(_residual(moved, v, K))
-                J[:, :, K] = _stack((ahead - R) / nudge[None, :, None])
-            step = _solve(J, _stack(R))
-            # A full Newton step far outside the orbit's size is a step off the branch: damp it.
-            turn_rate = np.clip(step[:, K], -0.05 * omega, 0.05 * omega)
-            if free:
-                step[:, K] = 0.0
-                omega = omega - turn_rate
-            length = np.max(np.abs(step), axis=1) / np.max(size, axis=0)
-            step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
-            v = v - _unstack(step, v.shape)
-    converged = error < 1e-8
-    predicted = np.asarray(velocity(loop, v, K))
-    return Orbits(v, predicted, omega, converged & np.isfinite(predicted).all(axis=1))
+        predicted = np.asarray(dual.value(_velocity(loop, forces)))
+    converged = (error < 1e-8) & np.isfinite(predicted).all(axis=1)
+    return Orbits(v, predicted, omega, converged)
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """P (loops, loops, runs, K) and Q (loops, runs, K) and their derivatives by ω."""
+
+    P: ComplexArray
+    Q: ComplexArray
+    dP: ComplexArray
+    dQ: ComplexArray
+
+    def __iter__(self) -> Iterator[ComplexArray]:
+        return iter((self.P, self.Q, self.dP, self.dQ))
+
+
+def _assembled(
+    structure: Structure, p: Values, at: Conditions, omega: FloatArray, free: bool, loops: int
+) -> tuple[Loop, _Terms]:
+    """The equations at harmonics of `omega`; in a free run Duals with ω as their only seed."""
+    K = at.harmonics
+    k = np.arange(1, K + 1)
+    s: Any = 1j * omega[:, None] * k
+    if free:
+        s = Dual(s, np.broadcast_to((1j * k)[:, None], (at.runs, K, 1)))
+    loop = structure.assemble(p, at, s)
+    P = np.empty((2, loops, loops, at.runs, K), dtype=complex)
+    Q = np.empty((2, loops, at.runs, K), dtype=complex)
+    for a in range(loops):
+        for out, term in (
+            (Q[:, a], loop.Q[a]),
+            *((P[:, a, b], loop.P[a][b]) for b in range(loops)),
+        ):
+            out[0] = dual.value(term)
+            out[1] = term.d[..., 0] if isinstance(term, Dual) else 0.0
+    return loop, _Terms(P[0], Q[0], P[1], Q[1])
+
+
+def _tables(curves: Sequence[Characteristic], rows: int) -> FloatArray:
+    """Coefficients (loops, rows, degree + 1) of all loops' curves, as `newton` takes them."""
+    tables = [n.table(rows) for n in curves if isinstance(n, Polynomial)]
+    out = np.zeros((len(tables), rows, max(t.shape[1] for t in tables)))
+    for own, t in zip(out, tables, strict=True):
+        own[:, : t.shape[1]] = t
+    return out
+
+
+def _sampled_newton(
+    N: Sequence[Characteristic],
+    terms: _Terms,
+    v: ComplexArray,
+    omega: FloatArray,
+    free: bool,
+    limit: IntArray,
+) -> tuple[ComplexArray, FloatArray, FloatArray, IntArray, ComplexArray]:
+    """What `identify.newton.newton` does, for characteristics of any kind: all rows together."""
+    K, begin, taken = v.shape[2], omega, np.zeros_like(limit)
+    while True:
+        away = (omega - begin)[:, None]
+        P, Q = terms.P + away * terms.dP, terms.Q + away * terms.dQ
+        forces = np.stack([_force(n, x, K) for n, x in zip(N, v, strict=True)])
+        R = v - Q - np.einsum("abrk,brk->ark", P, forces)
+        size = np.sqrt(np.sum(np.abs(v) ** 2, axis=2)) + 1e-300
+        error = np.max(np.sqrt(np.sum(np.abs(R) ** 2, axis=2)) / size, axis=0)
+        error = np.where(np.isfinite(error), error, np.inf)
+        going = (taken < limit) & (error >= TOLERANCE) & np.isfinite(error)
+        if not going.any():
+            return v, omega, error, taken, forces
+        J = _jacobian(tuple(map(tuple, P)), _slopes(N, v), K)
+        if free:  # the column of Im v_0,1, which stays 0, becomes ω's
+            by_omega = -terms.dQ - np.einsum("abrk,brk->ark", terms.dP, forces)
+            J[:, :, K] = _stack(by_omega)
+        step = np.where(going[:, None], _solve(J, _stack(R)), 0.0)
+        if free:
+            omega = omega - np.clip(step[:, K], -0.05 * omega, 0.05 * omega)
+            step[:, K] = 0.0
+        # A full Newton step far outside the orbit's size is a step off the branch: damp it.
+        length = np.max(np.abs(step), axis=1) / np.max(size, axis=0)
+        step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
+        v = v - _unstack(step, v.shape)
+        taken = taken + going
 
 
 def residual(structure: Structure, values: Values, at: Conditions, v: ComplexArray) -> ComplexArray:
     """The balance R of forced runs at any inputs `v`, both (loops, runs, K)."""
     s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
-    return np.stack(_residual(structure.assemble(values, at, s), v, at.harmonics))
-
-
-def _residual(loop: Loop, v: Any, K: int) -> list[Any]:
-    forces = [_force(n, x, K) for n, x in zip(loop.N, v, strict=True)]
-    return _balance(loop, v, forces)
+    loop = structure.assemble(values, at, s)
+    return np.stack(
+        _balance(loop, v, [_force(n, x, at.harmonics) for n, x in zip(loop.N, v, strict=True)])
+    )
 
 
 def _balance(loop: Loop, v: Any, forces: Sequence[Any]) -> list[Any]:
@@ -216,10 +291,10 @@ def _balance(loop: Loop, v: Any, forces: Sequence[Any]) -> list[Any]:
     return out
 
 
-def velocity(loop: Loop, v: Any, K: int) -> Any:
+def _velocity(loop: Loop, forces: Iterable[Any]) -> Any:
     total: Any = loop.G_u
-    for G, n, x in zip(loop.G, loop.N, v, strict=True):
-        total = total + G * _force(n, x, K)
+    for G, F in zip(loop.G, forces, strict=True):
+        total = total + G * F
     return loop.sensor(total)
 
 
@@ -236,6 +311,14 @@ def _force(n: Characteristic, v: Any, K: int) -> Any:
     return to_harmonics(n(to_time(v, K)), K)
 
 
+def _slopes(N: Sequence[Characteristic], v: ComplexArray) -> Sequence[ComplexArray]:
+    """∂N̂/∂x of every nonlinearity, (runs, K, 2K) each."""
+    K = v.shape[2]
+    if all(isinstance(n, Polynomial) for n in N):
+        return tuple(slopes(_tables(N, v.shape[1]), np.ascontiguousarray(v), *_waves(K)))
+    return [_force_jacobian(n, x, K) for n, x in zip(N, v, strict=True)]
+
+
 def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
     """∂N̂/∂x of one nonlinearity, (runs, K, 2K)."""
     if isinstance(n, Preceded):  # an output depends on inputs of other times
@@ -247,16 +330,16 @@ def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
     return np.asarray((forth[None] * slope[:, None, :]) @ back)
 
 
-def _jacobian(loop: Loop, slopes: Sequence[ComplexArray], K: int) -> FloatArray:
+def _jacobian(P: Sequence[Sequence[Any]], by_input: Sequence[ComplexArray], K: int) -> FloatArray:
     """∂R/∂x in real form, (runs, 2KL, 2KL) for L loops, unknowns loop by loop.
 
-    `slopes` are the ∂N̂/∂x of each nonlinearity.
+    `P` as in `Loop`; `by_input` are the ∂N̂/∂x of each nonlinearity.
     """
-    loops, runs = len(slopes), slopes[0].shape[0]
+    loops, runs = len(by_input), by_input[0].shape[0]
     J = np.zeros((runs, 2 * K * loops, 2 * K * loops))
     for b in range(loops):
         for a in range(loops):
-            block = -np.broadcast_to(loop.P[a][b], (runs, K))[:, :, None] * slopes[b]
+            block = -np.broadcast_to(P[a][b], (runs, K))[:, :, None] * by_input[b]
             rows, cols = slice(2 * K * a, 2 * K * (a + 1)), slice(2 * K * b, 2 * K * (b + 1))
             J[:, rows, cols] = np.concatenate([block.real, block.imag], axis=1)
     J[:, np.arange(2 * K * loops), np.arange(2 * K * loops)] += 1.0
@@ -283,13 +366,15 @@ def _differentiate(
         s = Dual(s, ds)
     loop = structure.assemble(values, at, s)
     v = orbits.inputs
-    plain = structure.assemble(plain_values, at, dual.value(s))
     forces = [_force(n, x, K) for n, x in zip(loop.N, v, strict=True)]
-    slopes = [_force_jacobian(n, x, K) for n, x in zip(plain.N, v, strict=True)]
+    if all(isinstance(n, Polynomial) for n in loop.N):
+        by_input = _slopes(loop.N, v)
+    else:  # derivatives by inputs need a characteristic that carries none by parameters
+        by_input = _slopes(structure.assemble(plain_values, at, dual.value(s)).N, v)
     R = _balance(loop, v, forces)
     explicit = np.stack([np.asarray(dual.derivative(r, (runs, K), seeds)) for r in R])
     right = np.concatenate([np.concatenate([x.real, x.imag], axis=1) for x in explicit], axis=1)
-    J = _jacobian(plain, slopes, K)
+    J = _jacobian([[dual.value(P) for P in row] for row in loop.P], by_input, K)
     dx = np.zeros_like(right)
     d_omega = None
     if free:
@@ -302,7 +387,7 @@ def _differentiate(
         dx = -_solve(J, right)
     total: Any = loop.G_u
     for b, (G, F) in enumerate(zip(loop.G, forces, strict=True)):
-        inner = slopes[b] @ dx[:, 2 * K * b : 2 * K * (b + 1)]
+        inner = by_input[b] @ dx[:, 2 * K * b : 2 * K * (b + 1)]
         total = total + G * Dual(dual.value(F), dual.derivative(F, (runs, K), seeds) + inner)
     y = loop.sensor(total)
     dy = np.array(dual.derivative(y, (runs, K), seeds), dtype=complex)
@@ -328,13 +413,13 @@ def drive_sensitivity(
     # the equations are linear in the drive: with a drive of one they give its transfer functions
     unit = structure.assemble(values, replace(at, drive=np.ones_like(at.drive)), s)
     loop = structure.assemble(values, at, s)
-    slopes = [_force_jacobian(n, x, K) for n, x in zip(loop.N, orbits.inputs, strict=True)]
+    by_input = _slopes(loop.N, orbits.inputs)
     entering = np.concatenate([_diagonal(q, at.runs, K) for q in unit.Q], axis=1)
-    dv = _solve(_jacobian(loop, slopes, K), entering)
+    dv = _solve(_jacobian(loop.P, by_input, K), entering)
     direct = _diagonal(unit.G_u, at.runs, K)
     total: ComplexArray = direct[:, :K] + 1j * direct[:, K:]
     for b, G in enumerate(loop.G):
-        inner = slopes[b] @ dv[:, 2 * K * b : 2 * K * (b + 1)]
+        inner = by_input[b] @ dv[:, 2 * K * b : 2 * K * (b + 1)]
         total = total + np.broadcast_to(G, (at.runs, K))[:, :, None] * inner
     nudge = 1e-6 * np.abs(orbits.velocity[:, :1])
     seen = (loop.sensor(orbits.velocity + nudge) - loop.sensor(orbits.velocity)) / nudge

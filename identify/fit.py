@@ -205,7 +205,7 @@ class OrbitResidual:
             start=start,
             start_omega=start_omega,
             derivatives=jacobian,
-            iterations=self.newton_steps or balance.MAX_ITERATIONS,
+            iterations=self.newton_steps,
         )
 
     def _remember(
@@ -356,6 +356,7 @@ def levenberg_marquardt(
     iterations: int = 60,
     tolerance: float = 1e-6,
     damping: float = 1e-3,
+    patience: int = 12,
     bounds: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Descent | None]:
     """Minimise |ρ(θ)|² from each of `thetas`, (starts, p), side by side.
@@ -363,8 +364,9 @@ def levenberg_marquardt(
     A descent is None where the residual does not exist at its start. Converged means that the
     step still to come would lower χ² by less than `tolerance` (absolute and relative): a hundredth
     of what a thousandth of a standard error is worth. Unknowns are scaled by the Jacobian's
-    columns (Marquardt), damping follows the gain ratio (Nielsen). Unknowns at a bound that the
-    gradient pushes against are held there; `bounds` are (p,) each, or (starts, p).
+    columns (Marquardt), damping follows the gain ratio (Nielsen); a descent ends after more than
+    `patience` refused steps in a row. Unknowns at a bound that the gradient pushes against are
+    held there; `bounds` are (p,) each, or (starts, p).
     """
     count, p = thetas.shape
     limits = bounds if bounds is not None else (np.full(p, -np.inf), np.full(p, np.inf))
@@ -383,7 +385,7 @@ def levenberg_marquardt(
         active = [(n, s) for n, s in enumerate(states) if s is not None and s.ended is None]
         trials, steps = [], []
         for n, s in active:
-            step = _propose(s, low[n], high[n], tolerance, iterations)
+            step = _propose(s, low[n], high[n], tolerance, iterations, patience)
             if step is not None:
                 trials.append((n, s))
                 steps.append(step)
@@ -425,7 +427,12 @@ def levenberg_marquardt(
 
 
 def _propose(
-    s: _State, low: FloatArray, high: FloatArray, tolerance: float, iterations: int
+    s: _State,
+    low: FloatArray,
+    high: FloatArray,
+    tolerance: float,
+    iterations: int,
+    patience: int,
 ) -> tuple[FloatArray, float] | None:
     """The next trial of a descent and its predicted decrease, or None where it has ended."""
     if s.refused == 0:
@@ -444,7 +451,7 @@ def _propose(
     if s.promise < tolerance * enough:
         s.converged, s.ended = True, "converged"
         return None
-    if s.refused > 12:
+    if s.refused > patience:
         s.converged = s.promise < 1e-3 * enough
         s.ended = "converged" if s.converged else "no step lowers the misfit any further"
         return None

@@ -444,6 +444,7 @@ def polish(
             straight.inside(thetas),
             iterations=iterations,
             tolerance=3e-2,
+            patience=6,  # a start that hardly moves any more is where it goes
             bounds=straight.bounds(structure),
         )
         pairs = zip(thetas, descents, strict=True)

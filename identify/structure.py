@@ -26,6 +26,7 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.parameters import Parameter, ParameterSet
+from identify.polynomial import Polynomial
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -354,35 +355,14 @@ class Structure:
         return H
 
     def _characteristic(self, p: Values) -> Characteristic:
-        if self.nonlinearity == "linear":
-            return lambda w: w
         if self.nonlinearity == "saturation":
             level = p["nonlinearity.level"]
             return lambda w: level * dual.tanh(w / level)
         if self.nonlinearity == "lagrange":
             values = [p[f"nonlinearity.value{j}"] for j in range(1, len(self.nodes) + 1)]
-            coefficients = _lagrange_coefficients(self.nodes, values)
-        else:
-            coefficients = [p[f"nonlinearity.c{d}"] for d in range(2, self.degree + 1)]
-
-        def polynomial(w: Any) -> Any:
-            x = dual.value(w)
-            plain = [dual.value(c) for c in coefficients]
-            total: Any = 0.0  # Horner's scheme from the highest degree down
-            slope: Any = 0.0
-            for d, c in reversed(list(enumerate(plain, start=2))):
-                total = (total + c) * x
-                slope = (slope + d * c) * x
-            value = x * (total + 1.0)
-            if not isinstance(w, Dual) and not any(isinstance(c, Dual) for c in coefficients):
-                return value
-            powers = [x * x]
-            for _ in coefficients[1:]:
-                powers.append(powers[-1] * x)
-            pairs = zip(powers, coefficients, strict=True)
-            return dual.chain(value, (slope + 1.0, w), *pairs)
-
-        return polynomial
+            return Polynomial((1.0, *_lagrange_coefficients(self.nodes, values)))
+        last = self.degree if self.nonlinearity == "polynomial" else 1
+        return Polynomial((1.0, *(p[f"nonlinearity.c{d}"] for d in range(2, last + 1))))
 
 
 def _characteristic_parameters(structure: Structure) -> list[Parameter]:

@@ -1,10 +1,16 @@
 """Harmonic balance against the thesis's numbers, and its derivatives against differences."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from identify import balance
-from identify.structure import Conditions, Structure
+from identify.dual import Dual
+from identify.effects import by_key
+from identify.polynomial import Polynomial
+from identify.structure import Characteristic, Conditions, Loop, Structure
 from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
 
 K = 7
@@ -99,3 +105,62 @@ def test_several_vectors_at_once_equal_one_by_one() -> None:
         assert alone.d_velocity is not None
         scale = np.max(np.abs(alone.d_velocity))
         assert np.max(np.abs(part.d_velocity - alone.d_velocity)) < 1e-8 * scale
+
+
+class Opaque:
+    """A characteristic that does not show that it is a polynomial."""
+
+    def __init__(self, inner: Characteristic) -> None:
+        self.inner = inner
+
+    def __call__(self, w: Any) -> Any:
+        return self.inner(w)
+
+
+@pytest.mark.parametrize("free", [False, True])
+def test_compiled_and_sampled_newton_find_the_same_orbits(
+    free: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With two loops, a bent characteristic and a gain of its own in every row."""
+    effect = by_key("nonlinear_damping:quadratic")
+    structure = Structure().with_effects(effect)
+    vector = np.r_[theta(Structure()), 1e-9]
+    both = np.stack([vector, vector * np.r_[np.full(vector.size - 1, 1.0002), 2.0]])
+    at = free_conditions() if free else forced_conditions()
+    compiled = balance.solve(structure, both, at, free=free, derivatives=True)
+    own = Structure.assemble
+
+    def hidden(self: Structure, *arguments: Any) -> Loop:
+        loop = own(self, *arguments)
+        return replace(loop, N=tuple(Opaque(n) for n in loop.N))
+
+    monkeypatch.setattr(Structure, "assemble", hidden)
+    sampled = balance.solve(structure, both, at, free=free, derivatives=True)
+    assert compiled.converged.all()
+    assert sampled.converged.all()
+    np.testing.assert_allclose(compiled.velocity, sampled.velocity, rtol=1e-9, atol=1e-3)
+    np.testing.assert_allclose(compiled.omega, sampled.omega, rtol=1e-11)
+    assert compiled.d_velocity is not None
+    scale = np.abs(sampled.d_velocity).max(axis=(0, 1))
+    assert np.all(np.abs(compiled.d_velocity - sampled.d_velocity) <= 1e-7 * scale)
+
+
+def test_a_row_that_finds_no_orbit_leaves_the_others_theirs() -> None:
+    good = theta(Structure())
+    lost = good + np.log(1.3) * (np.array(Structure().parameters.names) == "mode1.frequency_hz")
+    alone = balance.solve(Structure(), good, free_conditions(), free=True)
+    both = balance.solve(Structure(), np.stack([good, lost]), free_conditions(), free=True)
+    assert both.converged.tolist() == [True, False]
+    np.testing.assert_array_equal(both.velocity[0], alone.velocity[0])
+
+
+def test_a_polynomial_is_its_powers_and_knows_its_derivatives() -> None:
+    w = np.linspace(-2.0, 2.0, 9)[None]
+    n = Polynomial((1.0, 0.0, -0.3), bent=0.2).plus((2, 5), (0.5, 0.01))
+    powers = w + 0.5 * w**2 - 0.3 * w**3 + 0.01 * w**5 + 0.2 * w * np.abs(w)
+    np.testing.assert_allclose(n(w), powers)
+    slope = 1 + w - 0.9 * w**2 + 0.05 * w**4 + 0.4 * np.abs(w)
+    np.testing.assert_allclose(balance.slope_along(n, w), slope)
+    np.testing.assert_allclose(n.table(2), [[0.2, 1.0, 0.5, -0.3, 0.0, 0.01]] * 2)
+    seed = Dual(np.full((1, 1), -0.3), np.ones((1, 1, 1)))
+    np.testing.assert_allclose(Polynomial((1.0, 0.0, seed))(w).d[..., 0], w**3)

@@ -1,7 +1,6 @@
 """Campaign folders: what is read is what was written, and what cannot be used is refused."""
 
 import re
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -186,13 +185,9 @@ def test_free_run_may_have_a_silent_drive_only(tmp_path: Path, store: RunStore) 
 
 @pytest.mark.shared
 @pytest.mark.skipif(not SHARED.exists(), reason="../shared/cases is not here")
-def test_recorded_cases_open_quickly(store: RunStore) -> None:
-    opened = []
+def test_recorded_cases_open(store: RunStore) -> None:
+    """How fast: ``benchmarks/store_speed.py``."""
     for case in ("a-clean", "b-flame-delay"):
-        begin = time.process_time()
         campaign = load_campaign(open_campaign(SHARED / case, store))
-        opened.append(time.process_time() - begin)
-    assert len(campaign.runs) == 11
-    assert campaign.runs[1].signals["p1"].values.size == 20_000
-    # the target is 0.5 s of a quiet machine; processor time, since others may share it
-    assert min(opened) < 0.5
+        assert len(campaign.runs) == 11
+        assert campaign.runs[1].signals["p1"].values.size == 20_000

@@ -1,6 +1,5 @@
-"""Simulated campaigns: settled, entrained, reproducible, sealed, and quick."""
+"""Simulated campaigns: settled, entrained, reproducible, sealed."""
 
-import time
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -184,20 +183,3 @@ def test_a_campaign_is_exact_to_its_noise_even_at_80_db() -> None:
             off = (found - orbit.velocity[1:4]) / sigma
             squares += [*off.real**2, *off.imag**2]
     assert np.mean(squares) == pytest.approx(1.0, abs=0.52)
-
-
-def test_an_eleven_run_campaign_takes_well_under_a_second() -> None:
-    """0.2 s on an idle core; five times that is allowed for a busy one."""
-    config = build_config()
-    plan = [PlannedRun("free")] + [
-        PlannedRun("forced", float(f), 1.0, settle_s=3.0) for f in range(163, 173)
-    ]
-    simulate_campaign(config, plan[:2])
-    best = min(_timed(lambda: simulate_campaign(config, plan)) for _ in range(2))
-    assert best < 1.0
-
-
-def _timed(act: object) -> float:
-    start = time.perf_counter()
-    act()  # type: ignore[operator]
-    return time.perf_counter() - start

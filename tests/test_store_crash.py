@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 import zipfile
 from pathlib import Path
 
@@ -211,8 +210,8 @@ def test_export_has_a_manifest_and_retirement_checks_it(tmp_path: Path, store: R
     assert store.runs() == []
 
 
-def test_hundred_thousand_runs_page_quickly(store: RunStore) -> None:
-    """The target is 100 ms a page of 100; any page, also the last and with a filter."""
+def test_a_hundred_thousand_runs_are_listed_by_the_page(store: RunStore) -> None:
+    """Any page, also the last and with a filter; how fast: ``benchmarks/store_speed.py``."""
     store.catalogue.add_runs(
         RunSummary(
             f"c{i // 100:04d}", f"{i % 100:03d}-forced", "forced", "fit", 160.0 + i % 40, 1.0, 0.0,
@@ -220,15 +219,12 @@ def test_hundred_thousand_runs_page_quickly(store: RunStore) -> None:
         )
         for i in range(100_000)
     )  # fmt: skip
-    slowest = 0.0
     for query, after in (
         (RunQuery(), None),
         (RunQuery(), "c0998/050-forced"),
         (RunQuery(rig="rig3", min_frequency_hz=170.0), "c0500/000-forced"),
         (RunQuery(since="2026-01-05", until="2026-01-06"), None),
     ):
-        begin = time.process_time()
         page = store.runs(query, after=after, limit=100)
-        slowest = max(slowest, time.process_time() - begin)
         assert len(page) == 100
-    assert slowest < 0.1
+        assert after is None or all(f"{r.campaign}/{r.name}" > after for r in page)

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from identify import dual
 from identify.parameters import Parameter
+from identify.polynomial import Polynomial
 from identify.structure import (
-    Characteristic,
     Conditions,
     Effect,
     Known,
@@ -109,11 +108,7 @@ class NonlinearDamping(Effect):
     def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss:
         beta = p["nonlinear_damping.coefficient"]
         cubic = self.power == 3
-
-        def curve(v: object) -> object:
-            return v**3 if cubic else v * dual.absolute(v)  # type: ignore[operator]
-
-        characteristic: Characteristic = curve
+        characteristic = Polynomial((0.0, 0.0, 1.0)) if cubic else Polynomial((0.0,), bent=1.0)
         count = len(modes)
         if self.mode_count is not None:
             ones = [1.0] * count  # modes of another effect come after its own

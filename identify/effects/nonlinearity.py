@@ -9,6 +9,7 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.parameters import Parameter
+from identify.polynomial import Polynomial
 from identify.structure import Characteristic, Conditions, Effect, Known, Values
 
 Samples = npt.NDArray[np.float64]
@@ -37,6 +38,8 @@ class HigherOrder(Effect):
 
     def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
         coefficients = [p[f"nonlinearity_shape.c{d}"] for d in self.powers]
+        if isinstance(n, Polynomial):
+            return n.plus(self.powers, coefficients)
 
         def more(w: Any) -> Any:
             total = n(w)
