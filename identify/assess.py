@@ -139,7 +139,7 @@ def validation_p(predictions: Sequence[Prediction], covariance: FloatArray) -> f
 
 
 def assess(fit: Fit, data: Dataset) -> Assessment:
-    """Errors, limit cycles and every coefficient of a fitted model."""
+    """Errors, limit cycles and every coefficient of a fitted model, without its `lock_in`."""
     fitted = [predict(fit.structure, fit.theta, b) for b in data.fit]
     held_out = [predict(fit.structure, fit.theta, b) for b in data.validation]
     covariance = fit.covariance if fit.converged else None
@@ -159,13 +159,13 @@ def assess(fit: Fit, data: Dataset) -> Assessment:
         measured_cycle=_measured_cycle(data),
         model_cycle=_model_cycle(fit, data, fitted),
         cross_validated=not data.validation,
-        lock_in=_lock_in(fit, data),
         residual_tests=residual_tests(fit, data),
     )
 
 
-def _lock_in(fit: Fit, data: Dataset) -> tuple[LockIn, ...]:
-    """The model's lock-in boundary at every forced condition, by frequency."""
+def lock_in(fitted: tuple[Fit, Dataset]) -> tuple[LockIn, ...]:
+    """The model's lock-in boundary at every forced condition, by frequency; it takes seconds."""
+    fit, data = fitted
     if not fit.converged:
         return ()
     found = [row for b in (*data.fit, *data.validation) for row in boundary(fit, b)]

@@ -16,7 +16,7 @@ from identify import assess, design, drive, start, trace
 from identify.chances import rank_correlation
 from identify.dataset import Dataset
 from identify.effects import CANDIDATES, CATALOGUE
-from identify.executor import Executor, one_thread
+from identify.executor import Executor, InProcess, one_thread
 from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.parameters import Estimate
@@ -109,6 +109,7 @@ def diagnose(
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
     after = before if chosen is None else assess.assess(chosen.fit, data)
+    before, after = _with_lock_in(before, after, data, executor or InProcess())
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
     effects = (*_traced(chosen), *tones) if claimed and chosen else tuple(tones)
     report(1.0, "done")
@@ -131,6 +132,15 @@ def diagnose(
 def _better(new: Fit, old: Fit) -> bool:
     """Another minimum rather than the same one reached less tidily."""
     return new.chi2 < (1.0 if new.converged else 0.9) * old.chi2 - 1.0
+
+
+def _with_lock_in(
+    before: Assessment, after: Assessment, data: Dataset, executor: Executor
+) -> tuple[Assessment, Assessment]:
+    """Both with their lock-in boundaries."""
+    fits = [before.fit] if after is before else [before.fit, after.fit]
+    found = list(executor.map(assess.lock_in, [(fit, data) for fit in fits]))
+    return replace(before, lock_in=found[0]), replace(after, lock_in=found[-1])
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ def identify(
     report(0.2, "fitting the declared model")
     data, fit = drive.refitted(fit_structure(ready.structure, ready.data), ready.data)
     report(0.9, "validating")
-    assessment = assess.assess(fit, data)
+    assessment = replace(assess.assess(fit, data), lock_in=assess.lock_in((fit, data)))
     report(0.95, "intervals")
     bounds = profile.intervals(fit, data)
     report(1.0, "done")

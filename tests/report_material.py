@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import balance
-from identify.assess import assess
+from identify.assess import assess, lock_in
 from identify.dataset import build
 from identify.fit import fit_orbits
 from identify.harmonics import Harmonics
@@ -155,7 +155,10 @@ def pair() -> tuple[Assessment, Assessment]:
     before = fit_orbits(declared, data, tube(declared, **WITHOUT_DELAY), continuation=(0.0,))
     for fit in (before, after):
         assert fit.converged, fit.reason
-    return assess(before, data), assess(after, data)
+    first, second = (
+        replace(assess(fit, data), lock_in=lock_in((fit, data))) for fit in (before, after)
+    )
+    return first, second
 
 
 def identification() -> Identification:
