@@ -128,7 +128,9 @@ def drain(clients: list[LiveClient], until: float, counts: dict[str, int]) -> No
             time.sleep(0.05)  # a browser paints sixty times a second at most
 
 
-async def reader(url: str, campaign: str, rate: float, until: float, times: list[float]) -> None:
+async def reader(
+    url: str, campaign: str, rate: float, until: float, times: list[float], unanswered: list[str]
+) -> None:
     async with httpx.AsyncClient(base_url=f"{url}/api/v1", timeout=30, trust_env=False) as client:
         detail = (await client.get(f"/campaigns/{campaign}")).json()
         run = f"/campaigns/{campaign}/runs/{detail['runs'][0]['name']}"
@@ -136,7 +138,11 @@ async def reader(url: str, campaign: str, rate: float, until: float, times: list
 
         async def one(path: str) -> None:
             begun = time.perf_counter()
-            answer = await client.get(path)
+            try:
+                answer = await client.get(path)
+            except httpx.TransportError as error:  # such as a kept connection closed meanwhile
+                unanswered.append(f"{path}: {error!r}")
+                return
             times.append(time.perf_counter() - begun)
             assert answer.status_code == 200, answer.text
 
@@ -178,16 +184,18 @@ async def load(
     live = await asyncio.to_thread(lambda: [LiveClient(url) for _ in range(clients)])
     until = time.monotonic() + seconds
     reads: list[float] = []
+    unanswered: list[str] = []
     stops: list[float] = []
     silent: list[bool] = []
     await asyncio.gather(
-        reader(url, campaign, rate, until, reads),
+        reader(url, campaign, rate, until, reads, unanswered),
         *([stopper(url, until, stops, silent)] if stop else []),
         asyncio.to_thread(drain, live, until, counts),
     )
     for client in live:
         client.sock.close()
-    return {"reads": reads, "stops": stops, "silent": silent, **counts}
+    told = {"reads": reads, "unanswered": unanswered, "stops": stops, "silent": silent}
+    return told | counts
 
 
 def wait_for(address: str) -> None:
@@ -281,7 +289,7 @@ def main() -> None:
     print(f"acquisition     {got['frames']} frames of {got['channels']} channels at "
           f"{got['rate_hz']:g} Hz, {got['lost_frames']} lost, "
           f"{got['lost_by_counter']} by the counter in the file")  # fmt: skip
-    print(f"reads           {quantiles(seen['reads'])}")
+    print(f"reads           {quantiles(seen['reads'])}, {len(seen['unanswered'])} unanswered")
     if seen["stops"]:
         print(f"emergency stop  {quantiles(seen['stops'])}, "
               f"silence confirmed in {sum(seen['silent'])}")  # fmt: skip
