@@ -528,6 +528,7 @@ def _seen(state: State) -> dict[str, Any]:
         "phase_deg": math.degrees(math.atan2(seen.forced.imag, seen.forced.real)),
         "phase": state.phase,
         "threshold_v": state.threshold_v,
+        "threshold_sigma_v": state.threshold_sigma_v,
     }
 
 

@@ -123,6 +123,32 @@ def test_live_view_and_escape_stops(page: Any, server: Running) -> None:
         client.post("/rigs/quick/reset")
 
 
+def test_the_fit_that_goes_with_a_campaign_is_shown(page: Any, server: Running) -> None:
+    plan = {
+        "record_s": 0.5,
+        "cold": [],
+        "conditions": [{"offset": o} for o in (-0.05, -0.03, 0.03, 0.05, -0.04, 0.04)],
+        "online": {"wanted": {"mode2.damping": 1e-6}, "after_runs": 5},
+        "operating_points": [{"name": "lean", "set": {"flow": 1.02}, "settle_s": 0.1}],
+    }
+    go(page, server, "live/quick", "text=Live: quick")
+    fit = page.locator("section[aria-label='Fit so far']")
+    assert not fit.is_visible()
+    with server.client() as client:
+        answer = client.post("/campaigns", json={"rig": "quick", "plan": plan})
+        assert answer.status_code == 202, answer.text
+        page.wait_for_selector("text=after 6 forced runs", timeout=90 * SECONDS)
+        log = client.get(f"/jobs/{answer.json()['id']}/log").json()
+    told = next(line for line in reversed(log) if "fit after 6 runs" in line)
+    rows = fit.locator("tbody tr")
+    assert rows.count() == 11  # four numbers a mode, the flame's pole, two coefficients
+    wanted = rows.filter(has_text="mode2.damping")
+    assert "not yet" in wanted.inner_text()
+    assert "±" in wanted.inner_text()
+    assert fit.inner_text().split("χ²/dof ")[1].split(";")[0] in told
+    assert "lean" in page.inner_text("section[aria-label='Criterion']")
+
+
 def test_stop_button_is_in_reach_on_every_view_and_small_screens(
     page: Any, server: Running
 ) -> None:

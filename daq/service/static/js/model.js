@@ -2,7 +2,7 @@
 import { get } from "./api.js";
 import * as stream from "./stream.js";
 
-const rigs = new Map();   // name -> {job, campaign, free, conditions: Map, window, log: [], levels, spectrum, waveform}
+const rigs = new Map();   // name -> {job, campaign, free, point, review, conditions: Map, window, log: [], levels, spectrum, waveform}
 const jobs = new Map();
 const watchers = new Set();
 let queued = false;
@@ -11,7 +11,7 @@ export function of(name) {
   if (!rigs.has(name)) rigs.set(name, fresh());
   return rigs.get(name);
 }
-function fresh() { return { job: null, campaign: null, free: null, conditions: new Map(), window: null, current: null, log: [], outcome: null }; }
+function fresh() { return { job: null, campaign: null, free: null, point: null, review: null, conditions: new Map(), window: null, current: null, log: [], outcome: null }; }
 
 export const job = (id) => jobs.get(id);
 export const anyRunning = () => [...jobs.values()].some((one) => one.state === "running" && one.about.rig);
@@ -53,6 +53,8 @@ export function start() {
     const rig = forRig(event), { kind, index, data } = event.data;
     if (!rig) return;
     if (kind === "free") rig.free = data;
+    if (kind === "operating_point") rig.point = data;
+    if (kind === "review") rig.review = data;
     if (kind === "condition") { rig.current = { index, ...data }; rig.conditions.set(index, { ...data, state: "approaching" }); }
     if (kind === "window") {
       rig.window = data;

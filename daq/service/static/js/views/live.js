@@ -1,8 +1,9 @@
 // Live: what the rig does now, against its limits; steering; the tongue as it fills up.
 import { attempt, controlToken, get, keepToken, post, api } from "../api.js";
-import { card, h, num } from "../dom.js";
+import { card, h, num, table } from "../dom.js";
 import * as model from "../model.js";
 import { Curves, Portrait, scatter } from "../plot.js";
+import { plusMinus } from "./identification.js";
 
 const CRITERION_DB = -20;
 const COLOURS = ["--c1", "--c2", "--c3", "--c4"];
@@ -61,8 +62,10 @@ export default async function live([wanted]) {
   const portrait = new Portrait("Phase portrait: the first pressure channel against itself a quarter of a period earlier");
   const tongue = h("div", {});
   const tongueText = h("p", { class: "soft" }, "");
+  const fitText = h("p", { class: "soft" }, ""), fitTable = h("div", {});
+  const fit = card("", "Fit so far", fitText, fitTable);
   const log = h("div", { class: "log", role: "log", "aria-label": "Campaign's log", tabindex: "0" });
-  let facts = list.find((one) => one.name === name) || {}, logged = 0, tongueKey = "";
+  let facts = list.find((one) => one.name === name) || {}, logged = 0, tongueKey = "", fitted = null;
 
   async function refresh() {
     try { facts = await get(`/rigs/${name}`); } catch { return; }
@@ -88,6 +91,7 @@ export default async function live([wanted]) {
     if (seen.waveform) drawWave(seen.waveform);
     if (seen.spectrum) drawSpectrum(seen.spectrum);
     drawTongue(seen);
+    drawFit(seen.review);
     if (logged !== seen.log.length) {
       log.textContent = seen.log.slice(-200).join("\n");
       log.scrollTop = log.scrollHeight;
@@ -119,8 +123,22 @@ export default async function live([wanted]) {
       ["free limit cycle", seen.free ? `${num(seen.free.frequency_hz, 6)} Hz, ${num(seen.free.amplitude)}` : "–"],
       ["forcing", seen.window ? `${num(seen.window.frequency_hz, 6)} Hz at ${num(seen.window.drive_v, 3)} V` : "–"],
       ["phase", seen.window ? `${num(seen.window.phase_deg, 3)}° (${seen.window.phase})` : "–"],
-      ["threshold", seen.window?.threshold_v ? `${num(seen.window.threshold_v, 3)} V` : "–"]];
+      ["threshold", seen.window?.threshold_v ? `${num(seen.window.threshold_v, 3)}${seen.window.threshold_sigma_v ? ` ± ${num(seen.window.threshold_sigma_v, 2)}` : ""} V` : "–"],
+      ...(seen.point ? [["operating point", pointText(seen.point)]] : [])];
     values.replaceChildren(...pairs.flatMap(([k, v]) => [h("dt", {}, k), h("dd", {}, v)]));
+  }
+  const pointText = ({ point, name: called, ...reached }) => [`${point} ${called || ""}`.trim(), ...Object.entries(reached).map(([k, v]) => `${k} ${num(v)}`)].join(", ");
+  function drawFit(found) {
+    fit.hidden = !found;
+    if (!found || found === fitted) return;
+    fitted = found;
+    if (!found.parameters) { fitText.textContent = `after ${found.runs} runs: ${found.reason || "not converged"}`; return; }
+    const missing = Object.keys(found.missing).length;
+    fitText.textContent = `after ${found.runs} forced runs: χ²/dof ${num(found.chi2_per_dof, 3)}${found.converged ? "" : ", not converged"}${missing ? `; ${missing} not yet as precise as wanted` : ""}`;
+    fitTable.replaceChildren(table("Parameters so far", ["parameter", "value ± standard error", "unit", "relative", ""], Object.entries(found.parameters).map(([key, p]) => {
+      const share = found.relative_error[key];
+      return [key, plusMinus(p), p.unit, share === null ? "undetermined" : `${num(100 * share, 2)} %`, key in found.missing ? "not yet" : ""];
+    }), { numeric: [3] }));
   }
   function drawWave(event) {
     const [rows, columns] = event.shape, pressure = event.channels.map((c, i) => i).filter((i) => event.units[i] === "Pa").slice(0, 2);
@@ -166,6 +184,6 @@ export default async function live([wanted]) {
     h("section", { class: "card w5 livecard", "aria-label": "Waveform" }, h("h2", {}, "Waveform"), wave.root),
     h("section", { class: "card w3 livecard", "aria-label": "Phase portrait" }, h("h2", {}, "Phase portrait"), portrait.canvas),
     h("section", { class: "card w4 livecard", "aria-label": "Tongue" }, h("h2", {}, "Lock-in tongue"), tongue, tongueText),
-    card("", "Log", log));
+    fit, card("", "Log", log));
   return { title: `Live: ${name}`, content, close: () => { stopWatching(); clearInterval(timer); } };
 }
