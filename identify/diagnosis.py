@@ -111,7 +111,7 @@ def diagnose(
     after = before if chosen is None else assess.assess(chosen.fit, data)
     before, after = _with_lock_in(before, after, data, executor or InProcess())
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
-    effects = (*_traced(chosen), *tones) if claimed and chosen else tuple(tones)
+    effects = (*_traced(chosen, tried), *tones) if claimed and chosen else tuple(tones)
     report(1.0, "done")
     return Diagnosis(
         campaign=campaign.identifier or campaign.title,
@@ -242,7 +242,13 @@ def _judge(
         others = trace.rivals(best, trace.best_by_name(good))
         words = " + ".join(best.names)
         if not others:
-            return "traced", best, f"Adding {words} explains the data; no rival does."
+            forms = [
+                f" Its form, {', '.join([e.form, *rest])}, is not decided by them."
+                for e in best.effects
+                if (rest := trace.other_forms(best, good)[e.name])
+            ]
+            said = f"Adding {words} explains the data; no rival does."
+            return "traced", best, said + "".join(forms)
         names = ", ".join(" + ".join(t.names) for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."
     ranked = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)
@@ -299,10 +305,16 @@ def _candidates(
     return tuple(out)
 
 
-def _traced(chosen: Tried) -> tuple[TracedEffect, ...]:
-    estimates = chosen.estimates
+def _traced(chosen: Tried, tried: Sequence[Tried]) -> tuple[TracedEffect, ...]:
+    estimates, open_ = chosen.estimates, trace.other_forms(chosen, tried)
     return tuple(
-        TracedEffect(e.name, e.location, e.form, {q.name: estimates[q.name] for q in e.parameters})
+        TracedEffect(
+            e.name,
+            e.location,
+            e.form,
+            {q.name: estimates[q.name] for q in e.parameters},
+            open_[e.name],
+        )
         for e in chosen.effects
     )
 

@@ -245,18 +245,23 @@ class Candidate:
 
 @dataclass(frozen=True)
 class TracedEffect:
-    """One effect of the verdict, with its parameters."""
+    """One effect of the verdict, with its parameters.
+
+    `other_forms` of the same effect do as well on these data: which law it follows is open.
+    """
 
     effect: str
     location: str
     form: str
     parameters: Mapping[str, Estimate]
+    other_forms: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         return {
             "effect": self.effect,
             "location": self.location,
             "form": self.form,
+            "other_forms": list(self.other_forms),
             "parameters": {n: e.to_json() for n, e in self.parameters.items()},
         }
 

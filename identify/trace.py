@@ -619,6 +619,19 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     ]
 
 
+def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ...]]:
+    """By effect, its other forms that the data do not rule out against those of `best`."""
+    out: dict[str, list[str]] = {name: [] for name in best.names}
+    for t in others:
+        if t.key != best.key or not (t.adequate and t.plausible):
+            continue
+        if t.evidence < best.evidence + EVIDENCE:
+            for e in t.effects:
+                out[e.name].append(e.form)
+    own = {e.name: e.form for e in best.effects}
+    return {n: tuple(f for f in dict.fromkeys(forms) if f != own[n]) for n, forms in out.items()}
+
+
 def _extends(t: Tried, best: Tried) -> bool:
     """Whether `t` is `best` with an extension that the data do not ask for."""
     general = {n for e in t.effects for n in e.generalises}

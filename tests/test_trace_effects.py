@@ -105,6 +105,21 @@ def test_the_velocity_of_another_place_in_modes_of_unknown_shape(tmp_path: Path)
     assert only(ready, base, "sensor_offset:modal_2").adequate
 
 
+def test_a_form_that_the_data_leave_open_is_not_claimed(tmp_path: Path) -> None:
+    """Driven at one frequency a run, a short delay of the speaker is a pole as well."""
+    ready, base = recorded(tmp_path, 3, "actuator_dynamics", delay_s=1.5e-5)
+    forms = [by_key(f"actuator_dynamics:{form}") for form in ("pole", "delay")]
+    found = trace.try_effects(
+        ready.structure, ready.data, base, forms, executor=InProcess(), keep=2,
+        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
+    )  # fmt: skip
+    best = trace.best_form(found)
+    (chosen,) = best.effects
+    (other,) = {"pole", "delay"} - {chosen.form}
+    assert trace.other_forms(best, found) == {"actuator_dynamics": (other,)}
+    assert trace.other_forms(best, [best]) == {"actuator_dynamics": ()}
+
+
 def test_an_amplifier_at_its_rails(tmp_path: Path) -> None:
     ready, base = recorded(tmp_path, 29, "actuator_nonlinearity", clip_v=1.1)
     assert base.chi2_per_dof > trace.GROSS

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from identify.parameters import Estimate
-from identify.results import Assessment, Candidate, Diagnosis, Identification
+from identify.results import Assessment, Candidate, Diagnosis, Identification, TracedEffect
 
 VERDICTS = {
     "no_discrepancy": "No discrepancy: the declared model explains the data to within noise",
@@ -132,9 +132,7 @@ def _diagnosis(d: Diagnosis) -> Heading:
         evidence.append(f"The declared model's fit did not converge: {d.before.fit.reason}.")
     headline = VERDICTS[d.verdict]
     if d.verdict == "traced":
-        where = joined(
-            tuple(f"{e.effect}{f' ({e.form})' if e.form else ''}, {e.location}" for e in d.effects)
-        )
+        where = joined(tuple(f"{e.effect}{_forms(e)}, {e.location}" for e in d.effects))
         headline = f"Traced: {where}"
         parts = {n: x for e in d.effects for n, x in e.parameters.items()}
         evidence.append(f"Added to the model: {listed(parts)}.")
@@ -153,6 +151,12 @@ def _diagnosis(d: Diagnosis) -> Heading:
     if d.explanation:
         evidence.append(d.explanation)
     return Heading(d.verdict, headline, tuple(evidence))
+
+
+def _forms(e: TracedEffect) -> str:
+    """Its form in brackets, with those that do as well."""
+    forms = joined((e.form, *e.other_forms), last="or")
+    return f" ({forms})" if forms else ""
 
 
 def _misfit(subject: str, a: Assessment, p_value: float | None = None) -> str:
