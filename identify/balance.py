@@ -50,9 +50,9 @@ def _period(harmonics: int, samples: int | None = None) -> tuple[FloatArray, Com
 
 @lru_cache(maxsize=32)
 def _waves(harmonics: int) -> tuple[FloatArray, FloatArray]:
-    """cos mτ and sin mτ, m = 0 … 2K, at the same time samples: (2K + 1, T) each."""
+    """cos mτ and sin mτ, m = 0 … 2K, at the same time samples: (T, 2K + 1) each."""
     samples = _period(harmonics)[0].shape[0]
-    angle = 2 * np.pi * np.outer(np.arange(2 * harmonics + 1), np.arange(samples)) / samples
+    angle = 2 * np.pi * np.outer(np.arange(samples), np.arange(2 * harmonics + 1)) / samples
     return np.cos(angle), np.sin(angle)
 
 

@@ -13,11 +13,6 @@ where that ended, until nothing moves.
 
 import numba
 import numpy as np
-import numpy.typing as npt
-
-ComplexArray = npt.NDArray[np.complex128]
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
 
 
 # NaN and infinity keep their meaning: a row that diverges must be seen to.
@@ -52,8 +47,8 @@ def _eliminate(A, b, n):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def _sample(curve, v, cosines, sines, F, S):  # type: ignore[no-untyped-def]
-    """N̂ (K,) and the slope's coefficients S_0 … S_2K of one row; tables are (2K + 1, T)."""
-    K, T = v.size, cosines.shape[1]
+    """N̂ (K,) and the slope's coefficients S_0 … S_2K of one row; tables are (T, 2K + 1)."""
+    K, T = v.size, cosines.shape[0]
     for k in range(K):
         F[k] = 0.0
     for m in range(2 * K + 1):
@@ -61,7 +56,7 @@ def _sample(curve, v, cosines, sines, F, S):  # type: ignore[no-untyped-def]
     for t in range(T):
         x = 0.0
         for k in range(K):
-            x += v[k].real * cosines[k + 1, t] - v[k].imag * sines[k + 1, t]
+            x += v[k].real * cosines[t, k + 1] - v[k].imag * sines[t, k + 1]
         size = abs(x)
         total, slope = 0.0, 0.0
         for d in range(curve.size - 1, 0, -1):
@@ -70,9 +65,9 @@ def _sample(curve, v, cosines, sines, F, S):  # type: ignore[no-untyped-def]
         force = (total + curve[0] * size) * x * 2.0 / T
         slope = (slope + 2.0 * curve[0] * size) / T
         for k in range(K):
-            F[k] += complex(force * cosines[k + 1, t], -force * sines[k + 1, t])
+            F[k] += complex(force * cosines[t, k + 1], -force * sines[t, k + 1])
         for m in range(2 * K + 1):
-            S[m] += complex(slope * cosines[m, t], -slope * sines[m, t])
+            S[m] += complex(slope * cosines[t, m], -slope * sines[t, m])
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -51,6 +51,7 @@ PREFERENCE = 6.0  # what a form without a law must gain on one of the same effec
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
+PARENTS, MORE_PARENTS = 2, 3  # sets of effects that are extended; more while none suffices
 GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
 
@@ -324,8 +325,9 @@ def try_effects(
     chosen = _best(refined, keep, forms=2)
     out = refit(chosen, 0.7, 0.95)
     # … and then all forms of the best two: at coarse noise they could not be told apart
-    if not any(t.adequate for t in out):
-        names = list(dict.fromkeys(t.effects[-1].name for t in sorted(out, key=_misfit)))[:2]
+    if not any(t.adequate and t.plausible for t in out):
+        poor = [t for t in sorted(out, key=_misfit) if not t.adequate]
+        names = list(dict.fromkeys(t.effects[-1].name for t in poor))[:2]
         done = {task.effect.key for task, _ in chosen}
         reached = {t.effect.key: s for t, s in refined if s}
         rest = [
@@ -495,8 +497,12 @@ def search(
         if any(t.adequate and t.plausible and t.spread is None for t in everything):
             break
         grown: list[Tried] = []
-        parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
-        for parent in parents:
+        parents = sorted(level, key=lambda t: not t.fit.converged)
+        # where one alone leaves a gross misfit, its rank says little of its part in a pair
+        more = MORE_PARENTS if level[0].fit.chi2_per_dof > GROSS else 0
+        for i, parent in enumerate(parents[: PARENTS + more]):
+            if i >= PARENTS and any(t.adequate for t in grown):
+                break
             rest = [e for e in available if e.name not in parent.names]
             grown += try_effects(
                 parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,

@@ -62,6 +62,24 @@ def test_a_failure_says_why_and_the_service_lives(jobs: JobManager, work: str, s
     assert says in str(job.error)
 
 
+def test_what_took_long_is_not_forgotten_as_it_ends(tmp_path: Path, bus: Bus) -> None:
+    """An hour's acquisition outlasted 500 analyses, and its result was gone before it was read."""
+    manager = JobManager(tmp_path / "jobs", bus, keep=2)
+    first = manager.submit("wait", "first", f"{WORK}:wait", {}, lane="rig:a")
+    later = [manager.submit("d", "d", f"{WORK}:double", {"value": v}) for v in (1.0, 2.0, 3.0)]
+    for job in later:
+        until(ended, job)
+    until(lambda job: job.message == "waiting", first)
+    done = manager.send(first.id, "emergency_stop")
+    assert done is not None
+    assert done.wait(5)
+    until(ended, first)
+    assert first.result == {"heard": ["emergency_stop"]}
+    assert manager.get(first.id) is first
+    assert manager.get(later[1].id) is None
+    manager.close(2)
+
+
 def test_a_lane_runs_one_at_a_time_and_waiting_work_can_be_cancelled(jobs: JobManager) -> None:
     first = jobs.submit("wait", "first", f"{WORK}:wait", {}, lane="rig:a")
     second = jobs.submit("wait", "second", f"{WORK}:wait", {}, lane="rig:a")

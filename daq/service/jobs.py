@@ -329,7 +329,9 @@ class JobManager:
         self._dispatch()
 
     def _forget(self) -> None:
+        """Drop what ended longest ago: an hour's job that ends now is news, however old it is."""
         done = [job for job in self._jobs.values() if job.state in FINISHED]
+        done.sort(key=lambda job: job.finished or "")
         for job in done[: max(0, len(done) - self._keep)]:
             del self._jobs[job.id]
             (self._folder / f"{job.id}.json").unlink(missing_ok=True)

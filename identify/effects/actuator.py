@@ -59,7 +59,7 @@ class ActuatorDelay(Effect):
     """
 
     name, location, form = "actuator_dynamics", "actuator", "delay"
-    parameters = (Parameter("actuator_dynamics.delay_s", "s", -0.02, 0.05, scale=1e-4),)
+    parameters = (Parameter("actuator_dynamics.delay_s", "s", 0.0, 0.05, scale=1e-4),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.03 / known.free_hz,), (0.2 / known.free_hz,)]
