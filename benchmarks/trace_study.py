@@ -3,6 +3,7 @@
     python benchmarks/trace_study.py clean   --count 400     model exactly as declared
     python benchmarks/trace_study.py effects --count 600     one or two effects the model lacks
     python benchmarks/trace_study.py leftout --count 200     one effect that no candidate names
+    python benchmarks/trace_study.py thesis  --count 96      the thesis's rig, effect by effect
 
 Campaigns come from the simulated rig's own physics (random rigs, 30 to 80 dB noise, white or
 coloured, 4 to 16 runs); the diagnosis sees arrays only. Prints verdicts, wrong claims, a confusion
@@ -26,11 +27,15 @@ import numpy as np
 import identify
 from identify.effects import CANDIDATES
 from identify.record import Campaign, DeclaredModel, Medium, Run, Signal
+from simulated_rig import build_config
 from simulated_rig.campaigns import SimulatedCampaign, simulate_campaign
+from simulated_rig.config import RigConfig
 from simulated_rig.effects import EFFECTS
 from simulated_rig.random_rigs import random_campaign, random_rig
+from simulated_rig.seal import SealedEffect
 
 Truth = dict[str, float]
+SIZES = (0.5, 0.2, 0.85)  # of `thesis`: in the range from barely visible to gross
 
 
 def _time(t: Truth) -> float:
@@ -95,15 +100,14 @@ def to_campaign(c: SimulatedCampaign) -> Campaign:
     return Campaign(c.title, tuple(runs), medium, DeclaredModel(modes=c.declared_modes), c.title)
 
 
-def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
-    """Simulate and diagnose one campaign."""
-    mode, seed, only = task
+def any_rig(
+    mode: str, seed: int, only: str | None
+) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
+    """A random rig, one or two effects or none, and how many runs of each kind."""
     rng = np.random.default_rng([seed, 71])
-    record: dict[str, Any] = {"seed": seed, "mode": mode}
     rig = random_rig(
         seed, noise_db=(30.0, 80.0), coloured=bool(rng.uniform() < 0.3), modes=(1, 2, 2, 2, 3)
     )
-    modes = len(rig.plant.modes)
     effects = []
     if mode != "clean":
         keys = [k for k in EFFECTS if only is None or k.startswith(only)]
@@ -111,12 +115,30 @@ def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
         for key in rng.choice(keys, size=count, replace=False):
             effects.append(EFFECTS[str(key)].draw(rng, float(rng.uniform())))
     forced = int(rng.integers(3, 13)) if mode == "clean" else int(rng.integers(7, 11))
+    validation = min(3, max(1, forced // 3))
+    cold = int(rng.uniform() < 0.2)
+    return rig, effects, {"forced": forced, "validation": validation, "cold": cold}
+
+
+def thesis_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
+    """The thesis's rig in the layout of the recorded campaigns, effect by effect, size by size."""
+    keys = sorted(EFFECTS)
+    rng = np.random.default_rng([seed, 11])
+    size = SIZES[seed // len(keys) % len(SIZES)]
+    effect = EFFECTS[keys[seed % len(keys)]].draw(rng, size)
+    return build_config(noise_db=36.0), [effect], {"forced": 7, "validation": 3, "cold": 0}
+
+
+def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
+    """Simulate and diagnose one campaign."""
+    mode, seed, only = task
+    record: dict[str, Any] = {"seed": seed, "mode": mode}
+    rig, effects, conditions = thesis_rig(seed) if mode == "thesis" else any_rig(mode, seed, only)
+    modes = len(rig.plant.modes)
+    drawn = seed + 1000 if mode == "thesis" else seed
     try:
-        rig, plan = random_campaign(
-            seed, rig, effects, forced=forced, validation=min(3, max(1, forced // 3)),
-            cold=int(rng.uniform() < 0.2),
-        )  # fmt: skip
-        campaign = to_campaign(simulate_campaign(rig, plan, seed, declared_modes=modes))
+        rig, plan = random_campaign(drawn, rig, effects, **conditions)
+        campaign = to_campaign(simulate_campaign(rig, plan, drawn, declared_modes=modes))
     except ValueError as error:
         return {**record, "skipped": str(error)}
     record["truth"] = [
@@ -236,7 +258,7 @@ def report(records: list[dict[str, Any]]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("mode", choices=("clean", "effects", "leftout"))
+    parser.add_argument("mode", choices=("clean", "effects", "leftout", "thesis"))
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", help="effects whose key starts so")
