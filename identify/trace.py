@@ -51,7 +51,6 @@ PREFERENCE = 6.0  # what a form without a law must gain on one of the same effec
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
-PARENTS, MORE_PARENTS = 2, 3  # sets of effects that are extended; more while none suffices
 GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
 
@@ -497,12 +496,8 @@ def search(
         if any(t.adequate and t.plausible and t.spread is None for t in everything):
             break
         grown: list[Tried] = []
-        parents = sorted(level, key=lambda t: not t.fit.converged)
-        # where one alone leaves a gross misfit, its rank says little of its part in a pair
-        more = MORE_PARENTS if level[0].fit.chi2_per_dof > GROSS else 0
-        for i, parent in enumerate(parents[: PARENTS + more]):
-            if i >= PARENTS and any(t.adequate for t in grown):
-                break
+        parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
+        for parent in parents:
             rest = [e for e in available if e.name not in parent.names]
             grown += try_effects(
                 parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,
