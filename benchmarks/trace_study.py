@@ -4,6 +4,7 @@
     python benchmarks/trace_study.py effects --count 600     one or two effects the model lacks
     python benchmarks/trace_study.py leftout --count 200     one effect that no candidate names
     python benchmarks/trace_study.py thesis  --count 96      the thesis's rig, effect by effect
+    python benchmarks/trace_study.py mixed   --count 100     the same with none, one or two of them
 
 Campaigns come from the simulated rig's own physics (random rigs, 30 to 80 dB noise, white or
 coloured, 4 to 16 runs); the diagnosis sees arrays only. Prints verdicts, wrong claims, a confusion
@@ -129,11 +130,24 @@ def thesis_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]
     return build_config(noise_db=36.0), [effect], {"forced": 7, "validation": 3, "cold": 0}
 
 
+def mixed_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
+    """The thesis's rig with none, one or two effects of any size, more or fewer runs and noise."""
+    rng = np.random.default_rng([seed, 13])
+    count = int(rng.choice([0, 1, 2], p=[0.1, 0.3, 0.6]))
+    keys = rng.choice(sorted(EFFECTS), size=count, replace=False)
+    effects = [EFFECTS[str(k)].draw(rng, float(rng.uniform())) for k in keys]
+    runs = {"forced": int(rng.integers(6, 12)), "validation": int(rng.integers(2, 4)), "cold": 0}
+    return build_config(noise_db=float(rng.uniform(30.0, 50.0))), effects, runs
+
+
 def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
     """Simulate and diagnose one campaign."""
     mode, seed, only = task
     record: dict[str, Any] = {"seed": seed, "mode": mode}
-    rig, effects, conditions = thesis_rig(seed) if mode == "thesis" else any_rig(mode, seed, only)
+    if mode in ("thesis", "mixed"):
+        rig, effects, conditions = thesis_rig(seed) if mode == "thesis" else mixed_rig(seed)
+    else:
+        rig, effects, conditions = any_rig(mode, seed, only)
     modes = len(rig.plant.modes)
     drawn = seed + 1000 if mode == "thesis" else seed
     try:
@@ -258,7 +272,7 @@ def report(records: list[dict[str, Any]]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("mode", choices=("clean", "effects", "leftout", "thesis"))
+    parser.add_argument("mode", choices=("clean", "effects", "leftout", "thesis", "mixed"))
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", help="effects whose key starts so")

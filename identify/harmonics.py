@@ -7,6 +7,7 @@ found by linear least squares over the record (for a whole number of periods, th
 frequency is the drive's own, estimated from the drive channel; a free run's is estimated from
 the velocity. What the harmonics leave is noise, and its spectrum within a few hertz of kω gives
 the covariance of c_k, across harmonics too, because jitter of phase or amplitude correlates them.
+A coarse converter adds what these neighbours do not show (`identify.quantisation`).
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from identify.quantisation import added_variance
 from identify.record import Campaign, Kind, Medium, Role, Run
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -145,9 +147,10 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
         raise RecordError(f"run {run.name!r}: channel 'drive' is missing or constant")
     if mics is None:
         name = next(n for n, s in run.signals.items() if s.quantity == "velocity")
-        inputs = [values[name]]
+        names = [name]
     else:
-        inputs = [values[mics.lower], values[mics.upper]]
+        names = [mics.lower, mics.upper]
+    inputs = [values[n] for n in names]
     if run.kind == "free":
         # the pressure sum is the strongest signal and has the same frequency as the velocity
         reference = inputs[0] if mics is None else inputs[0] + inputs[1]
@@ -161,21 +164,34 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
     signals = np.stack([*inputs, drive if drive is not None else np.zeros_like(inputs[0])])
     c, rest = fit_harmonics(signals, rate, frequency, K)
     side = side_bins(rest, rate, frequency, K)
+    hidden = np.zeros(len(signals))
+    for i, name in enumerate([*names, "drive"]):
+        if name in run.signals:
+            hidden[i] = added_variance(
+                run.signals[name].resolution,
+                float(np.abs(c[i, 0])),
+                float(np.median(np.abs(side[i]) ** 2) / np.log(2)),
+                frequency,
+                rate,
+                signals.shape[1],
+            )
     if mics is None:
         velocity, pressure = c[0], np.zeros(K, dtype=complex)
         noise, pressure_noise = side[0], np.zeros(K)
+        coarse = np.full(K, hidden[0])
     else:
         offset = 2 * np.pi * side_offsets(run.duration_s)[:, None]
         scale = medium.density_kg_m3 * mics.spacing_m
         velocity = -(c[1] - c[0]) / (scale * 1j * omega)
         pressure = 0.5 * (c[0] + c[1])
         noise = -(side[1] - side[0]) / (scale * 1j * (omega + offset))
-        pressure_noise = np.mean(np.abs(side[0] + side[1]) ** 2, axis=0) / 4
+        pressure_noise = (np.mean(np.abs(side[0] + side[1]) ** 2, axis=0) + hidden[:2].sum()) / 4
+        coarse = hidden[:2].sum() / (scale * omega) ** 2
     drive_c = c[-1]
     reference_c = velocity[0] if run.kind == "free" else drive_c[0]
     turn = np.exp(-1j * np.angle(reference_c) * k)
     noise = noise * turn
-    covariance = coefficient_covariance(noise)
+    covariance = coefficient_covariance(noise) + np.diag(np.r_[coarse, coarse] / 2)
     stderr = 0.0
     if run.kind == "free":
         both = slice(0, len(inputs))
@@ -193,7 +209,7 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
         covariance=covariance,
         side=noise,
         pressure_noise=pressure_noise,
-        drive_variance=float(np.mean(np.abs(side[-1][:, 0]) ** 2)),
+        drive_variance=float(np.mean(np.abs(side[-1][:, 0]) ** 2) + hidden[-1]),
         started_s=run.started_s,
         duration_s=run.duration_s,
         nominal_hz=run.frequency_hz,

@@ -412,12 +412,14 @@ def _slow_flow_thetas(
     return thetas
 
 
-def coarse(structure: Structure, data: Dataset, starts: Iterable[FloatArray]) -> list[CoarseStart]:
-    """Starts with their misfit at ten per cent noise, best first."""
+def coarse(
+    structure: Structure, data: Dataset, starts: Iterable[FloatArray], share: float = 0.1
+) -> list[CoarseStart]:
+    """Starts with their misfit at ten per cent noise (or another `share`), best first."""
     thetas = list(starts)
     if not thetas:
         return []
-    residual = OrbitResidual(structure, soften(data.fit, 0.1), newton_steps=2)
+    residual = OrbitResidual(structure, soften(data.fit, share), newton_steps=2)
     outcome = residual(np.stack(thetas), np.arange(len(thetas)), False)
     costs = np.where(outcome.exists, np.sum(outcome.residual**2, axis=1), np.inf)
     found = [CoarseStart(float(c), t) for c, t in zip(costs, thetas, strict=True)]

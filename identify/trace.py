@@ -49,8 +49,14 @@ ALPHA = 1e-3  # false-alarm probability of each significance test
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
+REACH = (
+    10.0  # times the best χ² before the last stage: beyond it, refitted only if nothing else does
+)
+SURELY = 4  # so many are refitted in any case
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
+ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
+FINE = 0.015  # share of noise below which all harmonics are looked at
 GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
 
@@ -217,16 +223,25 @@ class _Task:
     base: Fit
     effect: Effect
     known: Known
-    far: bool
-    placements: tuple[tuple[float, ...], ...]
+    shares: tuple[float, float, float]  # of each coefficient's size that count as noise, by stage
+    placements: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def seen(self) -> Dataset:
+        """What the first stages look at: all harmonics where the misfit is small."""
+        return self.rough if self.shares[0] > FINE else self.data
+
+    @property
+    def proposals(self) -> list[tuple[float, ...]]:
+        """The effect's own starting values."""
+        return [tuple(row) for row in self.effect.starts(self.known)]
 
 
 def _first_stage(task: _Task) -> list[CoarseStart]:
-    """The best starts of one effect at five per cent noise, best first."""
+    """The best starts of one effect near the base fit at the first share of noise, best first."""
     larger = task.structure.with_effects(task.effect)
     own = task.effect.parameters
-    proposals = task.effect.starts(task.known)
-    inner = [[q.to_internal(v) for q, v in zip(own, row, strict=True)] for row in proposals]
+    inner = [[q.to_internal(v) for q, v in zip(own, row, strict=True)] for row in task.proposals]
     thetas = [np.r_[task.base.theta, row] for row in inner]
     neutral = task.effect.neutral()
     if neutral is not None:  # never worse than without the effect
@@ -236,11 +251,8 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
     if score is not None:
         bound = 20 * np.max(np.abs(inner), axis=0) + 1e-12
         thetas.append(np.r_[task.base.theta, np.clip(score.size, -bound, bound)])
-    starts = coarse(larger, task.rough, thetas)[:3]
-    if task.far:
-        inherited = [task.base.values[q.name] for e in task.structure.effects for q in e.parameters]
-        rows = [[*inherited, *row] for row in proposals]
-        starts += physical_starts(larger, task.rough, rows, task.placements)[:4]
+    first = task.shares[0]
+    starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
     richer = None if task.structure.effects else task.effect.restated(task.structure)
     if richer is not None:
         found = every_start(richer, task.rough)[:6]
@@ -248,22 +260,33 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
             task.effect.from_restated(task.structure, richer.parameters.plain(s.theta))
             for s in found
         ]
-        starts += coarse(larger, task.rough, [larger.parameters.to_internal(v) for v in restated])
-    return polish(larger, task.rough, starts, shares=(0.05,), iterations=8)[:3]
+        rows = [larger.parameters.to_internal(v) for v in restated]
+        starts += polish(larger, task.rough, coarse(larger, task.rough, rows), (ROUGH,), 8)[:2]
+    return polish(larger, task.seen, starts, (first,), 8)[:3]
+
+
+def _from_afar(task: _Task) -> list[CoarseStart]:
+    """The same from the slow flow corrected for the effect, wherever the base fit is."""
+    larger = task.structure.with_effects(task.effect)
+    inherited = [task.base.values[q.name] for e in task.structure.effects for q in e.parameters]
+    rows = [[*inherited, *row] for row in task.proposals]
+    starts = physical_starts(larger, task.rough, rows, task.placements)[:4]
+    led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
+    return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
 
 
 def _middle_stage(item: tuple[_Task, list[CoarseStart]]) -> list[CoarseStart]:
-    """The survivors' starts at one per cent noise, best first."""
+    """The survivors' starts at the second share of noise, best first."""
     task, starts = item
     larger = task.structure.with_effects(task.effect)
-    return polish(larger, task.rough, starts, shares=(0.01,), iterations=10)[:2]
+    return polish(larger, task.seen, starts, shares=(task.shares[1],), iterations=10)[:2]
 
 
 def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     task, starts = item
     larger = task.structure.with_effects(task.effect)
     thetas = np.stack([s.theta for s in starts])
-    fit = fit_orbits(larger, task.data, thetas, continuation=(0.003, 0.0))
+    fit = fit_orbits(larger, task.data, thetas, continuation=(task.shares[2], 0.0))
     return _canonical(task, fit)
 
 
@@ -280,6 +303,18 @@ def _canonical(task: _Task, fit: Fit) -> Fit:
     return renamed if renamed.converged else fit
 
 
+def _shares(base: Fit, data: Dataset) -> tuple[float, float, float]:
+    """Noise of the stages as shares of each coefficient's size: of the size of the misfit.
+
+    Much coarser, and an effect that explains it does no better than one that does not.
+    """
+    misfit = assess.relative_error(
+        [assess.predict(base.structure, base.theta, b) for b in data.fit]
+    )
+    first = float(np.clip(2 * misfit, 1e-4, ROUGH)) if np.isfinite(misfit) else ROUGH
+    return first, first / 5, min(0.003, first / 15)
+
+
 def try_effects(
     structure: Structure,
     data: Dataset,
@@ -293,16 +328,23 @@ def try_effects(
 ) -> list[Tried]:
     """Each effect added to `structure`; the best `keep` are refitted in full, best first.
 
-    Started near the `base` fit, or `far` from it, from the slow flow.
+    Started near the `base` fit; with `far` from the slow flow too, where none comes of that.
     """
     known = known_sizes(data, base)
     rough = data.coarse()
-    placements = _likely_placements(replace(structure, effects=()), rough) if far else ()
-    tasks = [_Task(structure, data, rough, base, e, known, far, placements) for e in effects]
+    shares = _shares(base, data)
+    tasks = [_Task(structure, data, rough, base, e, known, shares) for e in effects]
     staged: list[tuple[_Task, list[CoarseStart]]] = []
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
         staged.append((task, starts))
-        progress(len(staged) / len(tasks) * 0.5, f"trying {task.effect.key}")
+        progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
+    if far and not any(s and s[0].cost < 2 * data.residuals for _, s in staged):
+        placements = _likely_placements(replace(structure, effects=()), rough)
+        tasks = [replace(t, placements=placements) for t in tasks]
+        for i, starts in enumerate(executor.map(_from_afar, tasks)):
+            both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
+            staged[i] = (tasks[i], both)
+            progress(0.3 + (i + 1) / len(tasks) * 0.2, f"trying {tasks[i].effect.key} from afar")
     better = _heats(staged, 5 * keep // 2)
     refined: list[tuple[_Task, list[CoarseStart]]] = []
     for (task, _), starts in zip(better, executor.map(_middle_stage, better), strict=True):
@@ -320,11 +362,19 @@ def try_effects(
                 out.append(tried((*structure.effects, effect), fit, data))
         return out
 
-    # two forms of an effect at the most, so that other effects get their turn …
+    def found(out: Sequence[Tried]) -> bool:
+        return any(t.adequate and t.plausible for t in out)
+
+    # two forms of an effect at the most, so that other effects get their turn: first those within
+    # reach of the best …
     chosen = _best(refined, keep, forms=2)
-    out = refit(chosen, 0.7, 0.95)
+    limit = max(REACH * chosen[0][1][0].cost, chosen[:SURELY][-1][1][0].cost) if chosen else 0.0
+    within = [c for c in chosen if c[1][0].cost <= limit]
+    out = refit(within, 0.7, 0.85)
+    if not found(out):
+        out += refit([c for c in chosen if c[1][0].cost > limit], 0.85, 0.95)
     # … and then all forms of the best two: at coarse noise they could not be told apart
-    if not any(t.adequate and t.plausible for t in out):
+    if not found(out):
         poor = [t for t in sorted(out, key=_misfit) if not t.adequate]
         names = list(dict.fromkeys(t.effects[-1].name for t in poor))[:2]
         done = {task.effect.key for task, _ in chosen}
@@ -491,6 +541,7 @@ def search(
         report(0.6, "trying run-to-run scatter")
         everything += try_scatters(structure, data, base, scatters)
     level = best_by_name(singles)
+    extended: set[tuple[str, ...]] = {()}
     for _ in range(2, depth + 1):
         # a spread does not end the search: a pair may explain the same without chance
         if any(t.adequate and t.plausible and t.spread is None for t in everything):
@@ -498,6 +549,7 @@ def search(
         grown: list[Tried] = []
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
         for parent in parents:
+            extended.add(tuple(sorted(e.key for e in parent.effects)))
             rest = [e for e in available if e.name not in parent.names]
             grown += try_effects(
                 parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,
@@ -509,9 +561,46 @@ def search(
             grown = started_again(grown, data, run)
         everything += [eliminate(t, data) for t in grown]
         level = best_by_name(grown)
+    everything += _in_their_places(everything, structure, data, available, run, extended, report)
     return Search(
         tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
     )
+
+
+def _in_their_places(
+    tries: Sequence[Tried],
+    structure: Structure,
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    extended: set[tuple[str, ...]],
+    report: Progress,
+) -> list[Tried]:
+    """Other effects in the place of each of several that explain the data together.
+
+    The set was grown from one of them, so that only the places of the others have been contested.
+    `extended` are the sets (of keys, sorted) that have been grown from already.
+    """
+    good = [t for t in tries if t.adequate and t.plausible and t.spread is None]
+    if not good:
+        return []
+    best = best_form(good)
+    out: list[Tried] = []
+    for e in best.effects:
+        others = tuple(o for o in best.effects if o is not e)
+        if tuple(sorted(o.key for o in others)) in extended:
+            continue
+        rest = [a for a in available if a.name not in {o.name for o in best.effects}]
+        smaller = replace(structure, effects=others)
+        values = best.fit.values
+        theta = smaller.parameters.to_internal([values[n] for n in smaller.parameters.names])
+        base = fit_orbits(smaller, data, theta, continuation=(0.003, 0.0))
+        if np.isfinite(base.chi2):
+            out += try_effects(
+                smaller, data, base, rest, executor=run, keep=5, far=False,
+                progress=lambda share, text: report(0.95 + 0.05 * share, text),
+            )  # fmt: skip
+    return out
 
 
 def _other_forms(

@@ -70,12 +70,17 @@ def test_state_space_is_the_assembled_loop(name: str) -> None:
 
 @pytest.mark.parametrize("effect", LINEAR, ids=lambda e: e.key)
 def test_state_space_with_effects(effect: Effect) -> None:
+    assert_same_as_assembled(with_effect(effect))
+
+
+def test_state_space_refuses_what_is_not_rational() -> None:
+    """A distributed delay is n equal lags only where n = τ²/σ² is whole: at its start it is."""
+    (effect,) = (e for e in LINEAR if e.key == IRRATIONAL)
     fit = with_effect(effect)
-    if effect.key == IRRATIONAL:
-        with pytest.raises(ValueError, match=r"distributed_delay.*neither rational"):
-            to_state_space(fit, "flame")
-    else:
-        assert_same_as_assembled(fit)
+    theta = fit.theta.copy()
+    theta[-1] += 0.1
+    with pytest.raises(ValueError, match=r"distributed_delay.*neither rational"):
+        to_state_space(replace(fit, theta=theta), "flame")
 
 
 def test_state_space_refuses_a_negative_delay() -> None:

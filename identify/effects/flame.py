@@ -79,12 +79,16 @@ class FlameResonance(Effect):
 
 
 class DistributedDelay(Effect):
-    """A delay spread normally around its mean: exp(−sτ + s²σ²/2)."""
+    """A delay spread around its mean τ by σ, gamma-distributed: (1 + sσ²/τ)^(−τ²/σ²).
+
+    No delay is negative. With σ = τ/√n it is n equal lags in a row, from the extra pole (n = 1)
+    to the pure delay (n → ∞); a narrow one is as good as normal, exp(−sτ + s²σ²/2).
+    """
 
     name, location, form = "flame_dynamics", "flame", "distributed_delay"
     generalises = ("flame_delay",)
     parameters = (
-        Parameter("flame_dynamics.delay_s", "s", 0.0, 0.02, scale=1e-4),
+        Parameter("flame_dynamics.delay_s", "s", 1e-7, 0.02, "positive"),
         Parameter("flame_dynamics.spread_s", "s", 1e-7, 0.02, "positive"),
     )
 
@@ -94,7 +98,8 @@ class DistributedDelay(Effect):
 
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         tau, sigma = p["flame_dynamics.delay_s"], p["flame_dynamics.spread_s"]
-        return dual.exp(s * s * (sigma * sigma) * 0.5 - s * tau)
+        ratio = tau / sigma
+        return dual.exp(-(dual.log(s * (sigma / ratio) + 1.0) * (ratio * ratio)))
 
 
 EFFECTS: tuple[Effect, ...] = (
