@@ -124,17 +124,18 @@ def leading_exponent(orbit: Disturbed, row: int = 0, free: bool = False) -> comp
     omega = float(orbit.omega[row])
     real, imag = np.meshgrid(omega * np.array([0.0, -3e-3, -1e-2, -4e-2]), np.linspace(0, 0.5, 17))
     lam = (real + 1j * omega * imag).ravel()
-    many = orbit.repeated(row, lam.size)
     h = 1e-7 * omega
     step = np.full(lam.size, np.inf, dtype=complex)
+    moving = np.arange(lam.size)
     with np.errstate(all="ignore"):
         for _ in range(30):
-            ahead, behind = many.determinant(lam + h), many.determinant(lam - h)
-            step = 0.5 * (ahead + behind) * 2 * h / (ahead - behind)
-            length = np.abs(step)
-            step = step * np.minimum(1.0, 0.02 * omega / np.maximum(length, 1e-300))
-            lam = lam - step
-            if np.all((np.abs(step) < 1e-9 * omega) | ~np.isfinite(lam)):
+            many, here = orbit.repeated(row, moving.size), lam[moving]
+            ahead, behind = many.determinant(here + h), many.determinant(here - h)
+            newton = 0.5 * (ahead + behind) * 2 * h / (ahead - behind)
+            newton = newton * np.minimum(1.0, 0.02 * omega / np.maximum(np.abs(newton), 1e-300))
+            lam[moving], step[moving] = here - newton, newton
+            moving = moving[(np.abs(newton) >= 1e-9 * omega) & np.isfinite(lam[moving])]
+            if not moving.size:
                 break
         good = np.isfinite(lam) & (np.abs(step) < 1e-7 * omega)
     good &= np.abs(lam.imag) < 0.52 * omega
