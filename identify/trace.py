@@ -2,12 +2,13 @@
 
 1. Is there anything to explain? Whitened lack of fit on the fitted and on the validation runs.
 2. Every form of every candidate effect is added to the declared model and led from several starts
-   through coarse to full noise weight: from the declared fit (one Gauss–Newton step along the
-   effect's tangent, projected off what the fit absorbs), and from the slow flow corrected for
-   the effect, because a gross effect drags the declared fit far away. The worse half drops out
-   between stages.
+   to full noise weight, beginning with noise of the misfit's own size: from the declared fit (one
+   Gauss–Newton step along the effect's tangent, projected off what the fit absorbs), and, where
+   no effect stands out from there, from the slow flow corrected for the effect, because a gross
+   effect drags the declared fit far away. What falls behind drops out between stages.
 3. If no single effect explains the data to within noise, pairs are grown from the best singles,
-   then triples; an effect stays only if leaving it out makes the fit significantly worse.
+   then triples; an effect stays only if leaving it out makes the fit significantly worse, and
+   others are tried in the place of each.
 4. What explains the data must also predict the validation runs, lie in its plausible range, and
    have no rival: another effect that does as well, complexity counted (χ² + p ln n within 10).
 
@@ -315,6 +316,11 @@ def _shares(base: Fit, data: Dataset) -> tuple[float, float, float]:
     return first, first / 5, min(0.003, first / 15)
 
 
+def _one_stands_out(costs: Sequence[float], share: float) -> bool:
+    """Whether one effect takes away nearly all that the usual one leaves, seen at all harmonics."""
+    return share <= FINE and bool(costs) and min(costs) < float(np.median(costs)) / REACH
+
+
 def try_effects(
     structure: Structure,
     data: Dataset,
@@ -338,7 +344,7 @@ def try_effects(
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
         staged.append((task, starts))
         progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
-    if far and not any(s and s[0].cost < 2 * data.residuals for _, s in staged):
+    if far and not _one_stands_out([s[0].cost for _, s in staged if s], shares[0]):
         placements = _likely_placements(replace(structure, effects=()), rough)
         tasks = [replace(t, placements=placements) for t in tasks]
         for i, starts in enumerate(executor.map(_from_afar, tasks)):

@@ -17,6 +17,7 @@ from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.record import Campaign
 from identify.scatter import fit_scatter
+from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
@@ -210,3 +211,22 @@ def test_a_noisy_record_of_the_drive_is_no_discovery(tmp_path: Path) -> None:
     poor = identify.diagnose(late, catalogue=[by_key("channel_mismatch:phase")])
     assert poor.verdict == "unexplained"
     assert poor.noise_floor == pytest.approx(found.noise_floor, rel=0.1)
+
+
+def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
+    """A narrow distributed delay of the flame beside a drift: a plain delay, found first with the
+    drift added to it, is not claimed, because the drift with another response does as well."""
+    rig = build_config(noise_db=45.0)
+    effects = [
+        make_effect("parameter_drift/flame_gain", {"flame_gain_change": 0.004}),
+        make_effect("flame_dynamics/distributed_delay", {"mean_delay_s": 8e-5}),
+    ]
+    rig, plan = random_campaign(15, rig, effects, forced=6, validation=2)
+    write_campaign(simulate_campaign(rig, plan, 15, declared_modes=2), tmp_path)
+    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    keys = ("flame_delay", "flame_dynamics:second_time_scale", "parameter_drift:flame_gain")
+    base = start.fit_from_data(ready.structure, ready.data)
+    found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
+    best = trace.best_form([t for t in found.tried if t.adequate and t.plausible])
+    names = {best.key, *(t.key for t in trace.rivals(best, trace.best_by_name(found.tried)))}
+    assert names == {("flame_delay", "parameter_drift"), ("flame_dynamics", "parameter_drift")}
