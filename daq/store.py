@@ -164,14 +164,19 @@ class RunStore:
     # upkeep
 
     def rebuild(self) -> list[str]:
-        """Make the catalogue anew from the files; returns what could not be read."""
+        """Make the catalogue anew from the files; returns what could not be read.
+
+        A folder without card and runs is a campaign that was interrupted before it began.
+        """
         problems: list[str] = []
         self.catalogue.clear()
         for folder in self.folders():
             try:
                 card = read_card(folder / "campaign.json")
             except StoreError as error:
-                problems.append(str(error))
+                begun = any((folder / "runs").glob("*.h5"))
+                if begun or not isinstance(error, UnknownItem):
+                    problems.append(str(error))
                 continue
             summaries = []
             for path in sorted((folder / "runs").glob("*.h5")):

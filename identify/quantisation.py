@@ -72,5 +72,6 @@ def added_variance(
     for slip in SLIPS:
         period, slipped = repetition(frequency_hz, rate_hz, samples, slip / steepest)
         share = np.mean(np.sinc(np.outer(TERMS * slipped * steepest, COSINES)) ** 2, axis=1)
-        added = max(added, 4 * float(terms @ share) * (1 / period - 1 / samples))
+        shown = 1 / samples if 2 * period >= samples else 0.0  # of lines in every other bin
+        added = max(added, 4 * float(terms @ share) * (1 / period - shown))
     return added

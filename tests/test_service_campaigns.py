@@ -154,6 +154,20 @@ def test_emergency_stop_reaches_the_rigs_process_and_latches(
     assert client.post("/rigs/slow/reset").json()["state"] == "idle"
 
 
+def test_a_skipped_condition_is_left_out(server: Running, client: httpx.Client) -> None:
+    job = client.post("/campaigns", json={"rig": "slow", "plan": PLAN}).json()
+    number, campaign = job["id"], job["about"]["campaign"]
+    until(client, number, lambda _: "free" in event_kinds(server, number))
+    for count in (1, 2):
+        assert client.post(f"/jobs/{number}/skip").status_code == 202
+        until(client, number, lambda _, n=count: event_kinds(server, number).count("skipped") == n)
+    until(client, number, ended)
+    result = client.get(f"/jobs/{number}/result").json()
+    assert [o["status"] for o in result["outcomes"]].count("skipped") == 2
+    runs = client.get(f"/campaigns/{campaign}").json()["runs"]
+    assert [r["kind"] for r in runs] == ["free"]
+
+
 def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> None:
     job = client.post("/campaigns", json={"rig": "slow", "plan": PLAN}).json()
     number, campaign = job["id"], job["about"]["campaign"]

@@ -302,6 +302,7 @@ def answered(client: httpx.Client, path: str, timeout_s: float) -> bool:
         return False
 
 
+@pytest.mark.no_cover  # measuring coverage doubles the times
 def test_emergency_stop_answers_at_once_even_when_nothing_else_does(tmp_path: Path) -> None:
     """The process that knows the rigs hangs, and so does every thread that waits for it.
 

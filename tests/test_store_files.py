@@ -180,6 +180,16 @@ def test_catalogue_is_rebuilt_from_the_files(tmp_path: Path) -> None:
     assert again.card(card.id).medium == {"density_kg_m3": 1.1}
 
 
+def test_a_campaign_killed_before_it_began_is_no_problem(tmp_path: Path) -> None:
+    store = RunStore(tmp_path / "store")
+    runs = store.campaigns_dir / "c000" / "runs"
+    runs.mkdir(parents=True)
+    assert store.rebuild() == []
+    assert store.campaigns() == []
+    (runs / "000-free.h5").write_bytes(b"what was recorded")
+    assert ["no such campaign" in problem for problem in store.rebuild()] == [True]
+
+
 def test_names_cannot_leave_the_store(tmp_path: Path) -> None:
     store = RunStore(tmp_path / "store")
     card = store.create_campaign("x")
