@@ -37,7 +37,9 @@ def test_a_dry_run_over_rest_shows_the_chosen_conditions_and_what_they_bring(
 ) -> None:
     plan = {"record_s": 1.0, "design": {"campaign": known, "runs": 3, "minutes": 1.0}}
     with server.client() as client:
-        answer = client.post("/campaigns/dry-run", json={"rig": "delayed", "plan": plan})
+        answer = client.post(
+            "/campaigns/dry-run", json={"rig": "delayed", "plan": plan}, timeout=90
+        )
         wrong = {"rig": "delayed", "plan": {"design": {"campaign": "none"}}}
         refused = client.post("/campaigns/dry-run", json=wrong)
     assert answer.status_code == 200, answer.text
