@@ -140,14 +140,15 @@ def mixed_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]
     return build_config(noise_db=float(rng.uniform(30.0, 50.0))), effects, runs
 
 
+OWN_RIG = {"thesis": thesis_rig, "mixed": mixed_rig}
+
+
 def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
     """Simulate and diagnose one campaign."""
     mode, seed, only = task
     record: dict[str, Any] = {"seed": seed, "mode": mode}
-    if mode in ("thesis", "mixed"):
-        rig, effects, conditions = thesis_rig(seed) if mode == "thesis" else mixed_rig(seed)
-    else:
-        rig, effects, conditions = any_rig(mode, seed, only)
+    made = OWN_RIG[mode](seed) if mode in OWN_RIG else any_rig(mode, seed, only)
+    rig, effects, conditions = made
     modes = len(rig.plant.modes)
     drawn = seed + 1000 if mode == "thesis" else seed
     try:

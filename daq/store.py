@@ -171,15 +171,15 @@ class RunStore:
         problems: list[str] = []
         self.catalogue.clear()
         for folder in self.folders():
+            paths = sorted((folder / "runs").glob("*.h5"))
             try:
                 card = read_card(folder / "campaign.json")
             except StoreError as error:
-                begun = any((folder / "runs").glob("*.h5"))
-                if begun or not isinstance(error, UnknownItem):
+                if paths or not isinstance(error, UnknownItem):
                     problems.append(str(error))
                 continue
             summaries = []
-            for path in sorted((folder / "runs").glob("*.h5")):
+            for path in paths:
                 try:
                     summaries.append(read_summary(path, card.id))
                 except CorruptFile as error:

@@ -236,16 +236,17 @@ def _judge(
     """Verdict, the candidate it rests on, and the reason in words."""
     if not significant:
         return "no_discrepancy", None, "The declared model explains the data to within noise."
-    good = [t for t in tried if t.adequate and t.plausible]
+    good = [t for t in tried if t.explains]
     if good:
         best = trace.best_form(good)
         others = trace.rivals(best, trace.best_by_name(good))
         words = " + ".join(best.names)
         if not others:
+            open_ = trace.other_forms(best, good)
             forms = [
-                f" Its form, {', '.join([e.form, *rest])}, is not decided by them."
+                f" Its form, {', '.join([e.form, *open_[e.name]])}, is not decided by them."
                 for e in best.effects
-                if (rest := trace.other_forms(best, good)[e.name])
+                if open_[e.name]
             ]
             said = f"Adding {words} explains the data; no rival does."
             return "traced", best, said + "".join(forms)
@@ -295,7 +296,7 @@ def _candidates(
     tried: Sequence[Tried], chosen: Tried | None, base_chi2: float, base_parameters: int
 ) -> tuple[Candidate, ...]:
     ordered = trace.best_by_name(tried)
-    good = [t for t in ordered if t.adequate and t.plausible]
+    good = [t for t in ordered if t.explains]
     if chosen is not None:  # what the verdict rests on stands first
         ordered = [chosen, *(t for t in ordered if t.key != chosen.key)]
     out = []

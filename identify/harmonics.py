@@ -170,7 +170,7 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
             hidden[i] = added_variance(
                 run.signals[name].resolution,
                 float(np.abs(c[i, 0])),
-                float(np.median(np.abs(side[i]) ** 2) / np.log(2)),
+                float(typical(np.abs(side[i]) ** 2)),
                 frequency,
                 rate,
                 signals.shape[1],
@@ -264,6 +264,11 @@ def side_bins(
     return out
 
 
+def typical(power: FloatArray, axis: int | None = None) -> FloatArray:
+    """Mean power of noise in bins, from their median, which a foreign tone in one does not move."""
+    return np.asarray(np.median(power, axis=axis) / np.log(2))
+
+
 def coefficient_covariance(side: ComplexArray) -> FloatArray:
     """Covariance (2K, 2K) of [Re, Im] of the coefficients from neighbouring bins, (2M, K).
 
@@ -273,7 +278,7 @@ def coefficient_covariance(side: ComplexArray) -> FloatArray:
     """
     power = np.abs(side) ** 2
     # a foreign tone in one or two bins must not pass for noise: median-based outlier removal
-    limit = 8.0 * np.median(power, axis=0) / np.log(2)
+    limit = 8.0 * typical(power, axis=0)
     weight = (power <= limit).astype(float)
     used = np.maximum(weight.sum(axis=0), 1.0)
     variance = (power * weight).sum(axis=0) / used
@@ -381,7 +386,7 @@ def _frequency_stderr(c1: complex, side: ComplexArray, duration_s: float) -> flo
     power = np.abs(side) ** 2
     half = side.size // 2
     inner = np.mean(power[half - 3 : half + 3])
-    level = max(float(inner), float(np.median(power) / np.log(2)))
+    level = max(float(inner), float(typical(power)))
     phase = np.sqrt(level / 2) / abs(c1)
     return float(np.sqrt(12.0) * phase / duration_s / (2 * np.pi))
 

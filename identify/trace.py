@@ -50,9 +50,7 @@ ALPHA = 1e-3  # false-alarm probability of each significance test
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
-REACH = (
-    10.0  # times the best χ² before the last stage: beyond it, refitted only if nothing else does
-)
+REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
 SURELY = 4  # so many are refitted in any case
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
@@ -87,6 +85,11 @@ class Tried:
     @property
     def adequate(self) -> bool:
         return self.fit_p > ALPHA and not self.validation_p < ALPHA
+
+    @property
+    def explains(self) -> bool:
+        """Adequate, and with values that can be true."""
+        return self.adequate and self.plausible
 
     @property
     def evidence(self) -> float:
@@ -368,19 +371,16 @@ def try_effects(
                 out.append(tried((*structure.effects, effect), fit, data))
         return out
 
-    def found(out: Sequence[Tried]) -> bool:
-        return any(t.adequate and t.plausible for t in out)
-
     # two forms of an effect at the most, so that other effects get their turn: first those within
     # reach of the best …
     chosen = _best(refined, keep, forms=2)
-    limit = max(REACH * chosen[0][1][0].cost, chosen[:SURELY][-1][1][0].cost) if chosen else 0.0
-    within = [c for c in chosen if c[1][0].cost <= limit]
-    out = refit(within, 0.7, 0.85)
-    if not found(out):
-        out += refit([c for c in chosen if c[1][0].cost > limit], 0.85, 0.95)
+    costs = [starts[0].cost for _, starts in chosen]  # ascending
+    near = max(SURELY, sum(cost <= REACH * costs[0] for cost in costs))
+    out = refit(chosen[:near], 0.7, 0.85)
+    if not any(t.explains for t in out):
+        out += refit(chosen[near:], 0.85, 0.95)
     # … and then all forms of the best two: at coarse noise they could not be told apart
-    if not found(out):
+    if not any(t.explains for t in out):
         poor = [t for t in sorted(out, key=_misfit) if not t.adequate]
         names = list(dict.fromkeys(t.effects[-1].name for t in poor))[:2]
         done = {task.effect.key for task, _ in chosen}
@@ -509,7 +509,7 @@ def best_form(good: Sequence[Tried]) -> Tried:
 
 def _merit(t: Tried) -> tuple[bool, float]:
     """Adequate ones first, by evidence; the others by misfit."""
-    good = t.adequate and t.plausible
+    good = t.explains
     handicap = PREFERENCE if any(e.empirical for e in t.effects) else 0.0
     return not good, t.evidence + handicap if good else t.fit.chi2
 
@@ -543,14 +543,14 @@ def search(
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
     everything = [*singles, *_other_forms(singles, structure, data, available)]
-    if not any(t.adequate and t.plausible for t in everything):
+    if not any(t.explains for t in everything):
         report(0.6, "trying run-to-run scatter")
         everything += try_scatters(structure, data, base, scatters)
     level = best_by_name(singles)
     extended: set[tuple[str, ...]] = {()}
     for _ in range(2, depth + 1):
         # a spread does not end the search: a pair may explain the same without chance
-        if any(t.adequate and t.plausible and t.spread is None for t in everything):
+        if any(t.explains and t.spread is None for t in everything):
             break
         grown: list[Tried] = []
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
@@ -567,7 +567,7 @@ def search(
             grown = started_again(grown, data, run)
         everything += [eliminate(t, data) for t in grown]
         level = best_by_name(grown)
-    everything += _in_their_places(everything, structure, data, available, run, extended, report)
+    everything += _in_their_places(everything, data, available, run, extended, report)
     return Search(
         tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
     )
@@ -575,7 +575,6 @@ def search(
 
 def _in_their_places(
     tries: Sequence[Tried],
-    structure: Structure,
     data: Dataset,
     available: Sequence[Effect],
     run: Executor,
@@ -587,23 +586,20 @@ def _in_their_places(
     The set was grown from one of them, so that only the places of the others have been contested.
     `extended` are the sets (of keys, sorted) that have been grown from already.
     """
-    good = [t for t in tries if t.adequate and t.plausible and t.spread is None]
+    good = [t for t in tries if t.explains and t.spread is None]
     if not good:
         return []
     best = best_form(good)
+    rest = [a for a in available if a.name not in best.names]
     out: list[Tried] = []
     for e in best.effects:
         others = tuple(o for o in best.effects if o is not e)
         if tuple(sorted(o.key for o in others)) in extended:
             continue
-        rest = [a for a in available if a.name not in {o.name for o in best.effects}]
-        smaller = replace(structure, effects=others)
-        values = best.fit.values
-        theta = smaller.parameters.to_internal([values[n] for n in smaller.parameters.names])
-        base = fit_orbits(smaller, data, theta, continuation=(0.003, 0.0))
+        base = _with_fewer(best, others, data)
         if np.isfinite(base.chi2):
             out += try_effects(
-                smaller, data, base, rest, executor=run, keep=5, far=False,
+                base.structure, data, base, rest, executor=run, keep=5, far=False,
                 progress=lambda share, text: report(0.95 + 0.05 * share, text),
             )  # fmt: skip
     return out
@@ -616,7 +612,7 @@ def _other_forms(
 
     A form with one parameter less may do as well, and is then what should be named.
     """
-    good = [t for t in singles if t.adequate and t.plausible]
+    good = [t for t in singles if t.explains]
     if not good:
         return []
     best = min(good, key=lambda t: t.evidence)
@@ -642,6 +638,13 @@ def _other_forms(
     return out
 
 
+def _with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
+    """The fit with only some of the effects of `t`, started from its values."""
+    smaller, values = replace(t.fit.structure, effects=effects), t.fit.values
+    theta = smaller.parameters.to_internal([values[n] for n in smaller.parameters.names])
+    return fit_orbits(smaller, data, theta, continuation=(0.003, 0.0))
+
+
 def eliminate(candidate: Tried, data: Dataset) -> Tried:
     """Backward elimination: effects without which the fit is no worse than chance are dropped."""
     current = candidate
@@ -649,10 +652,7 @@ def eliminate(candidate: Tried, data: Dataset) -> Tried:
         smaller = []
         for leave in current.effects:
             rest = tuple(e for e in current.effects if e is not leave)
-            reduced = replace(current.fit.structure, effects=rest)
-            values = current.fit.values
-            theta = reduced.parameters.to_internal([values[n] for n in reduced.parameters.names])
-            fit = fit_orbits(reduced, data, theta, continuation=(0.003, 0.0))
+            fit = _with_fewer(current, rest, data)
             gain = fit.chi2 - current.fit.chi2
             freedom = current.fit.theta.size - fit.theta.size
             if np.isfinite(gain) and chi2_tail(gain, freedom) > ALPHA / len(CATALOGUE):
@@ -707,8 +707,7 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         t
         for t in others
         if t.key != best.key
-        and t.adequate
-        and t.plausible
+        and t.explains
         and t.evidence < best.evidence + EVIDENCE
         and not set(best.names) < set(t.names)
         and not _extends(t, best)
@@ -719,7 +718,7 @@ def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ..
     """By effect, its other forms that the data do not rule out against those of `best`."""
     out: dict[str, list[str]] = {name: [] for name in best.names}
     for t in others:
-        if t.key != best.key or not (t.adequate and t.plausible):
+        if t.key != best.key or not t.explains:
             continue
         if t.evidence < best.evidence + EVIDENCE:
             for e in t.effects:

@@ -8,7 +8,7 @@ import pytest
 
 from daq.importers import open_campaign
 from identify import assess, drive, start
-from identify.harmonics import fit_harmonics, side_bins
+from identify.harmonics import fit_harmonics, side_bins, typical
 from identify.identification import prepare
 from identify.load import load_campaign
 from identify.quantisation import added_variance, repeated, repetition
@@ -62,7 +62,7 @@ def test_the_error_is_as_large_as_foreseen(frequency_hz: float, noise: float) ->
         rounded = np.round(noisy / STEP) * STEP
         found, rest = fit_harmonics(rounded[None], RATE, frequency_hz, 3)
         power = np.abs(side_bins(rest, RATE, frequency_hz, 3)[0]) ** 2
-        level = float(np.median(power) / np.log(2))
+        level = float(typical(power))
         added = added_variance(STEP, abs(c[0]), level, frequency_hz, RATE, SAMPLES)
         ratios.append(np.abs(found[0] - c) ** 2 / (level + added))
     # neighbours that hold some of the repeated part already count it twice: at most 3 times less
