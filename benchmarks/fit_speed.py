@@ -60,7 +60,8 @@ def conditions(plant: Plant, runs: int, harmonics: int) -> Conditions:
     velocity[:, 0] = 2 * FREE_M_S * np.exp(-2j)
     nothing = np.zeros_like(drive)
     return Conditions(2 * np.pi * f, drive, nothing, velocity, np.linspace(0, 1, runs),
-                      np.ones(runs), np.arange(runs))  # fmt: skip
+                      np.ones(runs), np.arange(runs), np.zeros(runs, dtype=bool),
+                      np.ones(runs))  # fmt: skip
 
 
 def truth(structure: Structure, plant: Plant) -> FloatArray:

@@ -53,7 +53,7 @@ class Prediction:
 def predict(structure: Structure, theta: FloatArray, batch: Batch) -> Prediction:
     """Steady states of a batch with derivatives, followed from the measurement."""
     with np.errstate(all="ignore"):
-        orbits = balance.solve(structure, theta, batch.at, free=batch.free, derivatives=True)
+        orbits = balance.solve(structure, theta, batch.at, derivatives=True)
         residual, jacobian = compare(batch, orbits)
     assert jacobian is not None
     return Prediction(batch, orbits, residual, jacobian)

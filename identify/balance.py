@@ -82,8 +82,8 @@ class Orbits:
 
     `inputs`: nonlinearity inputs (loops, runs, K); `velocity`: predicted measurement (runs, K);
     `omega`: rad/s (solved for in free runs); `converged`: (runs,). With derivatives asked for,
-    `d_velocity` is (runs, K, p), `d_omega` (runs, p) and `d_inputs` (loops, runs, K, p), with
-    respect to the unknowns.
+    `d_velocity` is (runs, K, p), `d_omega` (runs, p) where a run is free and `d_inputs` (loops,
+    runs, K, p), with respect to the unknowns.
     """
 
     inputs: ComplexArray
@@ -112,68 +112,69 @@ def solve(
     theta: FloatArray,
     at: Conditions,
     *,
-    free: bool,
     start: ComplexArray | None = None,
     start_omega: FloatArray | None = None,
     derivatives: bool = False,
     iterations: int | None = None,
 ) -> Orbits:
-    """Steady states of one batch, all forced (or cold), or all free.
+    """Steady states of runs of any kind.
 
     Parameters
     ----------
     theta : internal parameters, (p,), or (vectors, p) for several at once: the orbits' rows are
         then vector by vector, the runs of `at` in each.
-    at : conditions; in a free batch `at.omega` is where the search for ω starts.
+    at : conditions; a free run's `at.omega` is where the search for its ω starts.
     start : nonlinearity inputs to start from, (loops, rows, K); default: from the measured
         velocity. A row that does not converge from `start` is tried from the measurement too.
     start_omega : where the search for ω starts instead, (rows,).
     iterations : at most that many Newton steps (default `MAX_ITERATIONS`). Few of them give an
         approximate orbit, marked as not converged, for a search still far from any solution.
     """
-    limit = iterations or MAX_ITERATIONS * (2 if free else 1)
     vectors = theta[None] if theta.ndim == 1 else theta
     rows = at.tile(vectors.shape[0])
+    limit = np.where(rows.free, 2, 1) * MAX_ITERATIONS
+    if iterations is not None:
+        limit = np.full(rows.runs, iterations)
     values = structure.parameters.plain(vectors, at.runs)
     begin = rows if start_omega is None else replace(rows, omega=start_omega)
     first = _inputs_from_velocity(structure, values, rows) if start is None else start
-    orbits = _newton(structure, values, begin, first, free, limit)
+    orbits = _newton(structure, values, begin, first, limit)
     if start is not None and not orbits.converged.all():
         again = np.flatnonzero(~orbits.converged)
         some = {n: v[again] for n, v in values.items()}
         fewer = rows.take(again)
         measured = _inputs_from_velocity(structure, some, fewer)
-        orbits = _merge(orbits, _newton(structure, some, fewer, measured, free, limit), again)
-    return differentiate(structure, vectors, at, orbits, free=free) if derivatives else orbits
+        orbits = _merge(orbits, _newton(structure, some, fewer, measured, limit[again]), again)
+    return differentiate(structure, vectors, at, orbits) if derivatives else orbits
 
 
 def differentiate(
-    structure: Structure, vectors: FloatArray, at: Conditions, orbits: Orbits, *, free: bool
+    structure: Structure, vectors: FloatArray, at: Conditions, orbits: Orbits
 ) -> Orbits:
     """The same orbits with derivatives by the unknowns; arguments as given to `solve`."""
     rows = at.tile(vectors.shape[0])
     values = structure.parameters.plain(vectors, at.runs)
-    return _differentiate(structure, vectors, values, rows, at.runs, orbits, free)
+    return _differentiate(structure, vectors, values, rows, at.runs, orbits)
 
 
 def _inputs_from_velocity(structure: Structure, values: Values, at: Conditions) -> ComplexArray:
     """Nonlinearity inputs implied by the measured velocity: the start on the measured branch."""
     k = np.arange(1, at.harmonics + 1)
-    loop = structure.assemble(values, at, 1j * at.omega[:, None] * k)
-    w = np.asarray(loop.H * at.velocity, dtype=complex)
-    return np.stack([w] + [at.velocity.copy() for _ in loop.N[1:]])
+    H = structure.flame_path(values, at, 1j * at.omega[:, None] * k)
+    w = np.asarray(H * at.velocity, dtype=complex)
+    return np.stack([w] + [at.velocity] * (structure.loops(values, at) - 1))
 
 
 def _newton(
-    structure: Structure, p: Values, at: Conditions, start: ComplexArray, free: bool, limit: int
+    structure: Structure, p: Values, at: Conditions, start: ComplexArray, limit: IntArray
 ) -> Orbits:
-    K = at.harmonics
-    v, omega, left = start.copy(), at.omega.copy(), np.full(at.runs, limit)
-    if free:
-        v = v * np.exp(-1j * np.angle(v[0, :, :1]) * np.arange(1, K + 1))
+    K, free = at.harmonics, at.free
+    v, omega, left = start.copy(), at.omega.copy(), limit
+    if free.any():
+        v[:, free] *= np.exp(-1j * np.angle(v[0, free, :1]) * np.arange(1, K + 1))
     with np.errstate(all="ignore"):
         while True:
-            loop, terms = _assembled(structure, p, at, omega, free, len(v))
+            loop, terms = _assembled(structure, p, at, omega, len(v))
             if all(isinstance(n, Polynomial) for n in loop.N):
                 curves = _tables(loop.N, at.runs)
                 cosines, sines = _waves(K)
@@ -184,8 +185,8 @@ def _newton(
                 v, omega, error, taken, forces = _sampled_newton(
                     loop.N, terms, v, omega, free, left
                 )
-            left = left - taken
-            if not free or not taken.any():  # solved where it was assembled
+            left = np.where(free, left - taken, 0)
+            if not taken[free].any():  # solved where it was assembled
                 break
         predicted = np.asarray(dual.value(_velocity(loop, forces)))
     converged = (error < 1e-8) & np.isfinite(predicted).all(axis=1)
@@ -206,14 +207,14 @@ class _Terms:
 
 
 def _assembled(
-    structure: Structure, p: Values, at: Conditions, omega: FloatArray, free: bool, loops: int
+    structure: Structure, p: Values, at: Conditions, omega: FloatArray, loops: int
 ) -> tuple[Loop, _Terms]:
-    """The equations at harmonics of `omega`; in a free run Duals with ω as their only seed."""
+    """The equations at harmonics of `omega`; with free runs, Duals with their ω as only seed."""
     K = at.harmonics
     k = np.arange(1, K + 1)
     s: Any = 1j * omega[:, None] * k
-    if free:
-        s = Dual(s, np.broadcast_to((1j * k)[:, None], (at.runs, K, 1)))
+    if at.free.any():
+        s = Dual(s, (at.free[:, None] * (1j * k))[..., None])
     loop = structure.assemble(p, at, s)
     P = np.empty((2, loops, loops, at.runs, K), dtype=complex)
     Q = np.empty((2, loops, at.runs, K), dtype=complex)
@@ -241,7 +242,7 @@ def _sampled_newton(
     terms: _Terms,
     v: ComplexArray,
     omega: FloatArray,
-    free: bool,
+    free: BoolArray,
     limit: IntArray,
 ) -> tuple[ComplexArray, FloatArray, FloatArray, IntArray, ComplexArray]:
     """What `identify.newton.newton` does, for characteristics of any kind: all rows together."""
@@ -258,13 +259,13 @@ def _sampled_newton(
         if not going.any():
             return v, omega, error, taken, forces
         J = _jacobian(tuple(map(tuple, P)), _slopes(N, v), K)
-        if free:  # the column of Im v_0,1, which stays 0, becomes ω's
+        if free.any():  # the column of Im v_0,1, which stays 0, becomes ω's
             by_omega = -terms.dQ - np.einsum("abrk,brk->ark", terms.dP, forces)
-            J[:, :, K] = _stack(by_omega)
+            J[free, :, K] = _stack(by_omega)[free]
         step = np.where(going[:, None], _solve(J, _stack(R)), 0.0)
-        if free:
-            omega = omega - np.clip(step[:, K], -0.05 * omega, 0.05 * omega)
-            step[:, K] = 0.0
+        away_by = np.where(free, np.clip(step[:, K], -0.05 * omega, 0.05 * omega), 0.0)
+        omega = omega - away_by
+        step[free, K] = 0.0
         # A full Newton step far outside the orbit's size is a step off the branch: damp it.
         length = np.max(np.abs(step), axis=1) / np.max(size, axis=0)
         step = step * np.minimum(1.0, 0.5 / np.maximum(length, 1e-300))[:, None]
@@ -353,16 +354,16 @@ def _differentiate(
     at: Conditions,
     runs_each: int,
     orbits: Orbits,
-    free: bool,
 ) -> Orbits:
     K, runs, p = at.harmonics, at.runs, vectors.shape[1]
     k = np.arange(1, K + 1)
-    seeds = p + int(free)
-    values = structure.parameters.seeded(vectors, runs_each, extra=int(free))
+    free, searched = at.free, bool(at.free.any())
+    seeds = p + int(searched)
+    values = structure.parameters.seeded(vectors, runs_each, extra=int(searched))
     s: Any = 1j * orbits.omega[:, None] * k
-    if free:
+    if searched:
         ds = np.zeros((runs, K, seeds), dtype=complex)
-        ds[:, :, p] = 1j * k
+        ds[free, :, p] = 1j * k
         s = Dual(s, ds)
     loop = structure.assemble(values, at, s)
     v = orbits.inputs
@@ -376,15 +377,13 @@ def _differentiate(
     right = np.concatenate([np.concatenate([x.real, x.imag], axis=1) for x in explicit], axis=1)
     J = _jacobian([[dual.value(P) for P in row] for row in loop.P], by_input, K)
     dx = np.zeros_like(right)
+    if searched:
+        J[free, :, K] = right[free, :, p]
+    dx[:, :, :p] = -_solve(J, right[:, :, :p])
     d_omega = None
-    if free:
-        J[:, :, K] = right[:, :, p]
-        solved = -_solve(J, right[:, :, :p])
-        d_omega = solved[:, K, :].copy()
-        solved[:, K, :] = 0.0
-        dx[:, :, :p] = solved
-    else:
-        dx = -_solve(J, right)
+    if searched:
+        d_omega = np.where(free[:, None], dx[:, K, :p], 0.0)
+        dx[free, K] = 0.0
     total: Any = loop.G_u
     for b, (G, F) in enumerate(zip(loop.G, forces, strict=True)):
         inner = by_input[b] @ dx[:, 2 * K * b : 2 * K * (b + 1)]

@@ -93,7 +93,10 @@ class Batch:
     def as_free(self, omega: float) -> "Batch":
         """The same runs posed as free ones near `omega`: no drive, the phase unknown."""
         at = replace(
-            self.at, free=True, omega=np.full(self.runs, omega), drive=np.zeros_like(self.at.drive)
+            self.at,
+            free=np.ones(self.runs, dtype=bool),
+            omega=np.full(self.runs, omega),
+            drive=np.zeros_like(self.at.drive),
         )
         return replace(self, free=True, at=at)
 
@@ -183,7 +186,7 @@ def _batch(
             row[: min(K, v.size)] = v[:K]
         return out
 
-    geometry = {} if mics is None else {"spacing_m": mics.spacing_m, "centre_m": mics.centre_m}
+    geometry = {} if mics is None else {"centre_m": mics.centre_m}
     at = Conditions(
         omega=2 * np.pi * np.array([h.frequency_hz for h in hs]),
         drive=pad([h.drive for h in hs]),
@@ -192,7 +195,8 @@ def _batch(
         time=np.array([h.started_s / span if span > 0 else 0.0 for h in hs]),
         flame_on=np.array([0.0 if h.kind == "cold" else 1.0 for h in hs]),
         identity=np.array([i for i, _ in rows], dtype=np.int64),
-        free=free,
+        free=np.full(len(hs), free),
+        spacing_m=np.full(len(hs), np.nan if mics is None else mics.spacing_m),
         density_kg_m3=medium.density_kg_m3,
         sound_speed_m_s=medium.sound_speed_m_s,
         **geometry,

@@ -46,7 +46,7 @@ def with_uncertain_drive(fit: Fit, data: Dataset) -> Dataset:
 def _added(fit: Fit, batch: Batch) -> Batch:
     if batch.free or batch.drive_noise is None or not np.any(batch.drive_noise > 0):
         return batch
-    orbits = balance.solve(fit.structure, fit.theta, batch.at, free=False)
+    orbits = balance.solve(fit.structure, fit.theta, batch.at)
     S = balance.drive_sensitivity(fit.structure, fit.theta, batch.at, orbits)
     K, total = batch.compared, batch.at.harmonics
     seen = S[:, np.r_[0:K, total : total + K]]

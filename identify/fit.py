@@ -16,6 +16,7 @@ all runs pull evenly; lowered step by step to zero, it leads the fit in (continu
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, reduce
 from typing import Protocol
 
 import numpy as np
@@ -25,7 +26,7 @@ from identify import balance
 from identify.balance import Orbits
 from identify.dataset import Batch, Dataset, whitener
 from identify.parameters import Estimate
-from identify.structure import Structure
+from identify.structure import Conditions, Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -156,78 +157,85 @@ class OrbitResidual:
         self.structure = structure
         self.batches = tuple(batches)
         self.newton_steps = newton_steps
-        self.known: dict[int, tuple[FloatArray, list[Orbits]]] = {}
-        self.solved: tuple[FloatArray, list[Orbits]] | None = None
+        self.known: dict[int, tuple[FloatArray, Orbits]] = {}
+        self.solved: tuple[FloatArray, Orbits] | None = None
+        self.tiled: dict[int, list[tuple[Batch, IntArray]]] = {}
 
     def __call__(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated:
         vectors = thetas.shape[0]
         exists = np.ones(vectors, dtype=bool)
-        rows, jacobians, found = [], [], []
-        for i, batch in enumerate(self.batches):
-            with np.errstate(all="ignore"):
-                orbits = self._orbits(thetas, which, i, jacobian)
-                rho, J = compare(batch.tile(vectors), orbits)
-            if self.newton_steps is None:
-                exists &= orbits.converged.reshape(vectors, batch.runs).all(axis=1)
-            rows.append(rho.reshape(vectors, -1))
-            if J is not None:
-                jacobians.append(J.reshape(vectors, -1, J.shape[-1]))
-            found.append(orbits)
+        rows, jacobians = [], []
+        with np.errstate(all="ignore"):
+            orbits = self._orbits(thetas, which, jacobian)
+            for batch, own in self._parts(vectors):
+                rho, J = compare(batch, orbits.take(own))
+                rows.append(rho.reshape(vectors, -1))
+                if J is not None:
+                    jacobians.append(J.reshape(vectors, -1, J.shape[-1]))
+        if self.newton_steps is None:
+            exists &= orbits.converged.reshape(vectors, -1).all(axis=1)
         residual = np.concatenate(rows, axis=1)
         exists &= np.isfinite(residual).all(axis=1)
         if not jacobian:
-            self.solved = thetas.copy(), found
+            self.solved = thetas.copy(), orbits
             return Evaluated(residual, None, exists)
         J_all = np.concatenate(jacobians, axis=1)
         exists &= np.isfinite(J_all).all(axis=(1, 2))
         if self.newton_steps is None:
-            self._remember(thetas, which, found, exists)
+            for n, descent in enumerate(which):
+                if exists[n]:
+                    self.known[int(descent)] = thetas[n].copy(), orbits.take(self._rows(n))
         return Evaluated(residual, J_all, exists)
 
-    def _orbits(self, thetas: FloatArray, which: IntArray, i: int, jacobian: bool) -> Orbits:
-        """Batch i's orbits; those that the last trial solved already are only differentiated."""
-        batch = self.batches[i]
+    @cached_property
+    def at(self) -> Conditions:
+        """All batches' runs, solved side by side."""
+        return reduce(Conditions.joined, [b.at for b in self.batches])
+
+    def _rows(self, vector: int) -> IntArray:
+        """The rows of one parameter vector among those of several."""
+        return vector * self.at.runs + np.arange(self.at.runs)
+
+    def _parts(self, vectors: int) -> list[tuple[Batch, IntArray]]:
+        """Each batch, tiled for so many vectors, and its rows among the solved ones."""
+        if vectors not in self.tiled:
+            ends = np.cumsum([b.runs for b in self.batches])
+            self.tiled[vectors] = [
+                (
+                    b.tile(vectors),
+                    np.concatenate([self._rows(n)[end - b.runs : end] for n in range(vectors)]),
+                )
+                for b, end in zip(self.batches, ends, strict=True)
+            ]
+        return self.tiled[vectors]
+
+    def _orbits(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Orbits:
+        """All runs' orbits; those that the last trial solved already are only differentiated."""
         if jacobian and self.solved is not None:
             same = [np.flatnonzero((self.solved[0] == t).all(axis=1)) for t in thetas]
             if all(s.size for s in same):
-                runs = np.arange(batch.runs)
-                rows = np.concatenate([int(s[0]) * batch.runs + runs for s in same])
-                orbits = self.solved[1][i].take(rows)
-                return balance.differentiate(
-                    self.structure, thetas, batch.at, orbits, free=batch.free
-                )
-        start, start_omega = self._predict(thetas, which, i)
+                orbits = self.solved[1].take(np.concatenate([self._rows(int(s[0])) for s in same]))
+                return balance.differentiate(self.structure, thetas, self.at, orbits)
+        start, start_omega = self._predict(thetas, which)
         return balance.solve(
             self.structure,
             thetas,
-            batch.at,
-            free=batch.free,
+            self.at,
             start=start,
             start_omega=start_omega,
             derivatives=jacobian,
             iterations=self.newton_steps,
         )
 
-    def _remember(
-        self, thetas: FloatArray, which: IntArray, found: Sequence[Orbits], exists: BoolArray
-    ) -> None:
-        for n, descent in enumerate(which):
-            if exists[n]:
-                parts = [
-                    o.take(np.arange(n * b.runs, (n + 1) * b.runs))
-                    for o, b in zip(found, self.batches, strict=True)
-                ]
-                self.known[int(descent)] = thetas[n].copy(), parts
-
     def _predict(
-        self, thetas: FloatArray, which: IntArray, i: int
+        self, thetas: FloatArray, which: IntArray
     ) -> tuple[ComplexArray | None, FloatArray | None]:
-        """Where batch i's orbits are expected: the last ones, carried along their derivatives."""
+        """Where the orbits are expected: the last ones, carried along their derivatives."""
         if any(int(n) not in self.known for n in which):
             return None, None
         inputs, omegas = [], []
         for theta, n in zip(thetas, which, strict=True):
-            before, orbits = self.known[int(n)][0], self.known[int(n)][1][i]
+            before, orbits = self.known[int(n)]
             assert orbits.d_inputs is not None
             step = theta - before
             inputs.append(orbits.inputs + orbits.d_inputs @ step)

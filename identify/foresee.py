@@ -194,9 +194,9 @@ def _alike(options: Sequence[Option]) -> list[list[Option]]:
 
 def _predict(structure: Structure, theta: FloatArray, batch: Batch) -> Seen:
     with np.errstate(all="ignore"):
-        orbits = balance.solve(structure, theta, batch.at, free=batch.free)
+        orbits = balance.solve(structure, theta, batch.at)
         orbits = _again(structure, theta, batch, orbits)
-        orbits = balance.differentiate(structure, theta[None], batch.at, orbits, free=batch.free)
+        orbits = balance.differentiate(structure, theta[None], batch.at, orbits)
         residual, jacobian = compare(batch, orbits)
     assert jacobian is not None
     n = batch.runs
@@ -220,7 +220,7 @@ def _again(
     apart = apart + 100 * (batch.cold[failed, None] != batch.cold[solved])
     start = orbits.inputs.copy()
     start[:, failed] = orbits.inputs[:, solved[np.argmin(apart, axis=1)]]
-    return balance.solve(structure, theta, batch.at, free=False, start=start, iterations=30)
+    return balance.solve(structure, theta, batch.at, start=start, iterations=30)
 
 
 def _batch(options: Sequence[Option], ready: Prepared, reference: Fit, misfit: float) -> Batch:
@@ -243,15 +243,15 @@ def _batch(options: Sequence[Option], ready: Prepared, reference: Fit, misfit: f
         time=np.full(n, 1.0 + LATER_S / span if span > 0 else 1.0),
         flame_on=np.array([0.0 if o.kind == "cold" else 1.0 for o in options]),
         identity=len(ready.measured) + np.arange(n),
-        free=free,
-        spacing_m=sign * recorded.at.spacing_m,
+        free=np.full(n, free),
+        spacing_m=sign * recorded.at.spacing_m[rows],
     )
     velocity = _free_cycle(ready, at.velocity) if free else at.velocity
     ratio = _pressure_over_velocity(ready, omega[:, None] * k / (2 * np.pi))
     for _ in range(2):  # once for the velocity, once for the sensors' effects that come of it
         at = replace(at, velocity=velocity, pressure=ratio * velocity)
         with np.errstate(all="ignore"):
-            found = balance.solve(reference.structure, reference.theta, at, free=free)
+            found = balance.solve(reference.structure, reference.theta, at)
         velocity = np.where(found.converged[:, None], found.velocity, velocity)
     measured = velocity[:, :K]
     seconds = np.array([o.record_s for o in options])

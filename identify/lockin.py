@@ -110,7 +110,7 @@ def _bracket(
 
     def held(factor: float, start: ComplexArray | None) -> Orbits | None:
         with np.errstate(all="ignore"):
-            orbits = balance.solve(structure, theta, _scaled(at, factor), free=False, start=start)
+            orbits = balance.solve(structure, theta, _scaled(at, factor), start=start)
         if not orbits.converged[0]:
             return None
         values = structure.parameters.plain(theta)

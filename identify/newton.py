@@ -91,7 +91,8 @@ def slopes(curves, v, cosines, sines):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True, error_model="numpy")
 def newton(P, Q, dP, dQ, curves, v, omega, cosines, sines, free, limit, tolerance):  # type: ignore[no-untyped-def]
-    """Steps of every row from `v` (loops, rows, K), changed in place, as `omega` (rows,) is.
+    """Steps of every row from `v` (loops, rows, K), changed in place, as `omega` (rows,) is
+    where `free` (rows,).
 
     P (loops, loops, rows, K), Q (loops, rows, K) and their derivatives by ω; `curves` (loops,
     rows, degree + 1) as `Polynomial.table` gives them. Returns the relative residual of each row
@@ -148,7 +149,7 @@ def newton(P, Q, dP, dQ, curves, v, omega, cosines, sines, free, limit, toleranc
                 for k in range(K):
                     i = 2 * K * a + k
                     step[i], step[i + K] = R[a, k].real, R[a, k].imag
-                    if free:  # Im v_0,1 stays 0: its column is ω's
+                    if free[r]:  # Im v_0,1 stays 0: its column is ω's
                         by_omega = -dQ[a, r, k]
                         for b in range(loops):
                             by_omega -= dP[a, b, r, k] * forces[b, r, k]
@@ -156,7 +157,7 @@ def newton(P, Q, dP, dQ, curves, v, omega, cosines, sines, free, limit, toleranc
             if not _eliminate(J, step, n):
                 error[r] = np.inf
                 break
-            if free:
+            if free[r]:
                 omega[r] -= min(max(step[K], -0.05 * omega[r]), 0.05 * omega[r])
                 step[K] = 0.0
             # A full Newton step far outside the orbit's size is a step off the branch: damp it.

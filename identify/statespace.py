@@ -73,6 +73,8 @@ def standing_still(rows: int = 1) -> Conditions:
         time=np.zeros(rows),
         flame_on=np.ones(rows),
         identity=np.zeros(rows, dtype=np.int64),
+        free=np.zeros(rows, dtype=bool),
+        spacing_m=np.ones(rows),
     )
 
 

@@ -35,13 +35,18 @@ Characteristic = Callable[[Any], Any]  # static function of time samples, shape 
 NONLINEARITIES = ("polynomial", "saturation", "lagrange", "linear")
 
 
+BY_RUN = ("omega", "time", "flame_on", "identity", "free", "spacing_m")
+BY_HARMONIC = ("drive", "pressure", "velocity")
+
+
 @dataclass(frozen=True)
 class Conditions:
     """What is known of a batch of runs before any model: one row a run, one column a harmonic.
 
     Arrays of shape (runs,) or (runs, harmonics); `drive`, `pressure` and `velocity` are measured
     Fourier coefficients, zero above the harmonics that were measured. `time` runs from 0 at the
-    campaign's start to 1 at the start of its last run; `flame_on` is 0 for cold runs.
+    campaign's start to 1 at the start of its last run; `flame_on` is 0 for cold runs. Of a `free`
+    run `omega` is only near its frequency; `spacing_m` is negative where microphones are exchanged.
     """
 
     omega: FloatArray
@@ -51,8 +56,8 @@ class Conditions:
     time: FloatArray
     flame_on: FloatArray
     identity: npt.NDArray[np.int64]
-    free: bool = False
-    spacing_m: float = 0.0508
+    free: npt.NDArray[np.bool_]
+    spacing_m: FloatArray
     centre_m: float = 0.6858
     density_kg_m3: float = 1.2
     sound_speed_m_s: float = 343.0
@@ -67,12 +72,24 @@ class Conditions:
 
     def take(self, rows: npt.NDArray[np.int64]) -> "Conditions":
         """The same for some of the runs."""
-        names = ("omega", "drive", "pressure", "velocity", "time", "flame_on", "identity")
-        return replace(self, **{n: getattr(self, n)[rows] for n in names})
+        return replace(self, **{n: getattr(self, n)[rows] for n in (*BY_RUN, *BY_HARMONIC)})
 
     def tile(self, times: int) -> "Conditions":
         """All runs repeated `times` times, for as many parameter vectors at once."""
         return self.take(np.tile(np.arange(self.runs), times)) if times > 1 else self
+
+    def joined(self, other: "Conditions") -> "Conditions":
+        """These runs, then the other's, with as many harmonics as either has."""
+        K = max(self.harmonics, other.harmonics)
+
+        def wide(c: ComplexArray) -> ComplexArray:
+            return np.pad(c, ((0, 0), (0, K - c.shape[1])))
+
+        rows = {n: (getattr(self, n), getattr(other, n)) for n in BY_RUN}
+        for n in BY_HARMONIC:
+            rows[n] = wide(getattr(self, n)), wide(getattr(other, n))
+        joined: dict[str, Any] = {n: np.concatenate(pair) for n, pair in rows.items()}
+        return replace(self, **joined)
 
 
 @dataclass(frozen=True)
@@ -274,19 +291,9 @@ class Structure:
 
     def assemble(self, p: Values, at: Conditions, s: Any) -> Loop:
         """The loop's equations at the complex frequencies `s`, shape (runs, harmonics)."""
-        modes = [
-            Mode(
-                p[f"mode{i}.frequency_hz"],
-                p[f"mode{i}.damping"],
-                p[f"mode{i}.flame_residue"],
-                p[f"mode{i}.speaker_residue"],
-            )
-            for i in range(1, self.mode_count + 1)
-        ]
-        for e in self.effects:
-            modes = e.modes(p, at, modes)
+        modes = self._modes(p, at)
         resonators = [_resonator(m, s) for m in modes]
-        H = self._flame_path(p, at, s)
+        H = self.flame_path(p, at, s)
         drive: Any = at.drive
         for e in self.effects:
             drive = e.drive(p, at, drive)
@@ -317,7 +324,7 @@ class Structure:
         for e in self.effects:
             if (operator := e.operator(p)) is not None:
                 n = Preceded(n, operator)
-        losses = [x for e in self.effects if (x := e.loss(p, at, modes)) is not None]
+        losses = self._losses(p, at, modes)
         if not losses:
             q = H * (from_drive * drive)
             return Loop(
@@ -343,7 +350,29 @@ class Structure:
             H,
         )
 
-    def _flame_path(self, p: Values, at: Conditions, s: Any) -> Any:
+    def loops(self, p: Values, at: Conditions) -> int:
+        """How many nonlinearities the equations have."""
+        return 1 + len(self._losses(p, at, self._modes(p, at)))
+
+    def _modes(self, p: Values, at: Conditions) -> list[Mode]:
+        modes = [
+            Mode(
+                p[f"mode{i}.frequency_hz"],
+                p[f"mode{i}.damping"],
+                p[f"mode{i}.flame_residue"],
+                p[f"mode{i}.speaker_residue"],
+            )
+            for i in range(1, self.mode_count + 1)
+        ]
+        for e in self.effects:
+            modes = e.modes(p, at, modes)
+        return modes
+
+    def _losses(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Loss]:
+        return [x for e in self.effects if (x := e.loss(p, at, modes)) is not None]
+
+    def flame_path(self, p: Values, at: Conditions, s: Any) -> Any:
+        """From the velocity at the flame to the nonlinearity's input."""
         H: Any = 1.0
         for j in range(1, self.flame_order + 1):
             pole = 2 * np.pi * p["flame.pole_hz" if j == 1 else f"flame.pole{j}_hz"]

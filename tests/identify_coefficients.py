@@ -31,8 +31,9 @@ def clean(conditions: tuple[tuple[float, float], ...], noise: float) -> Dataset:
     start[:, 0] = 5e6 * np.exp(-2j)
     at = replace(forced_conditions(), omega=2 * np.pi * np.array([f for f, _ in conditions]),
                  drive=drive, pressure=np.zeros_like(drive), velocity=start,
-                 time=np.linspace(0, 1, n), flame_on=np.ones(n), identity=np.arange(n))  # fmt: skip
-    orbits = balance.solve(STRUCTURE, theta(STRUCTURE), at, free=False)
+                 time=np.linspace(0, 1, n), flame_on=np.ones(n), identity=np.arange(n),
+                 free=np.zeros(n, dtype=bool), spacing_m=np.full(n, 0.0508))  # fmt: skip
+    orbits = balance.solve(STRUCTURE, theta(STRUCTURE), at)
     assert orbits.converged.all()
     size = noise * 2.4e6
     measured = [

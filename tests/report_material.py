@@ -79,11 +79,13 @@ def steady(structure: Structure, theta: FloatArray) -> list[tuple[float, npt.NDA
             time=np.zeros(1),
             flame_on=np.ones(1),
             identity=np.zeros(1, dtype=np.int64),
+            free=np.array([hz is None]),
+            spacing_m=np.ones(1),
         )
         for phase in np.linspace(0, 2 * np.pi, 12, endpoint=False):  # until Newton finds it
             w = np.zeros((1, 1, K), dtype=complex)
             w[0, 0, 0] = (2e-4 if hz is None else 3e-4) * np.exp(1j * phase)
-            orbits = balance.solve(structure, theta, at, free=hz is None, start=w)
+            orbits = balance.solve(structure, theta, at, start=w)
             if orbits.converged.all() and abs(orbits.velocity[0, 0]) > 0.05:
                 break
         else:

@@ -35,6 +35,8 @@ def forced_conditions() -> Conditions:
         time=np.linspace(0, 1, n),
         flame_on=np.ones(n),
         identity=np.arange(n),
+        free=np.zeros(n, dtype=bool),
+        spacing_m=np.full(n, 0.0508),
     )
 
 
@@ -50,13 +52,14 @@ def free_conditions() -> Conditions:
         time=np.zeros(1),
         flame_on=np.ones(1),
         identity=np.arange(1),
-        free=True,
+        free=np.ones(1, dtype=bool),
+        spacing_m=np.full(1, 0.0508),
     )
 
 
 def test_forced_orbits_are_the_thesis_steady_states() -> None:
     structure = Structure()
-    orbits = balance.solve(structure, theta(structure), forced_conditions(), free=False)
+    orbits = balance.solve(structure, theta(structure), forced_conditions())
     assert orbits.converged.all()
     expected = np.array([row[2] for row in STEADY])
     # physics.md gives six digits: one unit of the last one
@@ -67,7 +70,7 @@ def test_forced_orbits_are_the_thesis_steady_states() -> None:
 
 def test_free_limit_cycle_is_the_thesis_one() -> None:
     structure = Structure()
-    orbits = balance.solve(structure, theta(structure), free_conditions(), free=True)
+    orbits = balance.solve(structure, theta(structure), free_conditions())
     assert orbits.converged.all()
     assert orbits.omega[0] / (2 * np.pi) == pytest.approx(FREE_HZ, abs=5e-4)
     np.testing.assert_allclose(np.abs(orbits.velocity[0, :3]), FREE_HARMONICS, rtol=3e-4)
@@ -78,14 +81,14 @@ def test_derivatives_agree_with_differences(free: bool) -> None:
     structure = Structure()
     at = free_conditions() if free else forced_conditions()
     t0 = theta(structure)
-    exact = balance.solve(structure, t0, at, free=free, derivatives=True)
+    exact = balance.solve(structure, t0, at, derivatives=True)
     assert exact.d_velocity is not None
     for j in range(t0.size):
         # a central difference errs by h²: 1e-10 relative here; rounding gives 1e-16/h = 1e-11
         h = np.zeros_like(t0)
         h[j] = 1e-5 * max(abs(t0[j]), 1e-7)
-        up = balance.solve(structure, t0 + h, at, free=free, start=exact.inputs)
-        down = balance.solve(structure, t0 - h, at, free=free, start=exact.inputs)
+        up = balance.solve(structure, t0 + h, at, start=exact.inputs)
+        down = balance.solve(structure, t0 - h, at, start=exact.inputs)
         difference = (up.velocity - down.velocity) / (2 * h[j])
         size = np.max(np.abs(difference)) + 1e-12 * np.max(np.abs(exact.velocity)) / abs(h[j])
         error = np.max(np.abs(difference - exact.d_velocity[:, :, j]))
@@ -96,9 +99,9 @@ def test_several_vectors_at_once_equal_one_by_one() -> None:
     structure = Structure()
     at = forced_conditions()
     vectors = theta(structure) * np.array([[1.0], [1.0001], [0.9999]])
-    together = balance.solve(structure, vectors, at, free=False, derivatives=True)
+    together = balance.solve(structure, vectors, at, derivatives=True)
     for i, vector in enumerate(vectors):
-        alone = balance.solve(structure, vector, at, free=False, derivatives=True)
+        alone = balance.solve(structure, vector, at, derivatives=True)
         part = together.take(np.arange(i * at.runs, (i + 1) * at.runs))
         np.testing.assert_allclose(part.velocity, alone.velocity, rtol=1e-9)
         assert part.d_velocity is not None
@@ -127,7 +130,7 @@ def test_compiled_and_sampled_newton_find_the_same_orbits(
     vector = np.r_[theta(Structure()), 1e-9]
     both = np.stack([vector, vector * np.r_[np.full(vector.size - 1, 1.0002), 2.0]])
     at = free_conditions() if free else forced_conditions()
-    compiled = balance.solve(structure, both, at, free=free, derivatives=True)
+    compiled = balance.solve(structure, both, at, derivatives=True)
     own = Structure.assemble
 
     def hidden(self: Structure, *arguments: Any) -> Loop:
@@ -135,7 +138,7 @@ def test_compiled_and_sampled_newton_find_the_same_orbits(
         return replace(loop, N=tuple(Opaque(n) for n in loop.N))
 
     monkeypatch.setattr(Structure, "assemble", hidden)
-    sampled = balance.solve(structure, both, at, free=free, derivatives=True)
+    sampled = balance.solve(structure, both, at, derivatives=True)
     assert compiled.converged.all()
     assert sampled.converged.all()
     np.testing.assert_allclose(compiled.velocity, sampled.velocity, rtol=1e-9, atol=1e-3)
@@ -148,8 +151,8 @@ def test_compiled_and_sampled_newton_find_the_same_orbits(
 def test_a_row_that_finds_no_orbit_leaves_the_others_theirs() -> None:
     good = theta(Structure())
     lost = good + np.log(1.3) * (np.array(Structure().parameters.names) == "mode1.frequency_hz")
-    alone = balance.solve(Structure(), good, free_conditions(), free=True)
-    both = balance.solve(Structure(), np.stack([good, lost]), free_conditions(), free=True)
+    alone = balance.solve(Structure(), good, free_conditions())
+    both = balance.solve(Structure(), np.stack([good, lost]), free_conditions())
     assert both.converged.tolist() == [True, False]
     np.testing.assert_array_equal(both.velocity[0], alone.velocity[0])
 

@@ -52,9 +52,10 @@ def solved(options: tuple[Option, ...], effect: str, value: float) -> list[Harmo
         time=np.ones(n),
         flame_on=np.array([0.0 if o.kind == "cold" else 1.0 for o in options]),
         identity=np.arange(n),
-        free=free,
+        free=np.full(n, free),
+        spacing_m=np.ones(n),
     )
-    orbits = balance.solve(model, theta, at, free=free, iterations=60)
+    orbits = balance.solve(model, theta, at, iterations=60)
     assert orbits.converged.all()
     return [
         Harmonics(

@@ -30,7 +30,7 @@ def disturbed(factor: float = 1.0, free: bool = False) -> tuple[Disturbed, balan
     start = None  # weak forcing is followed down from strong forcing
     for share in np.linspace(1.0, factor, 1 if factor == 1 else 12):
         at = replace(at, drive=drive * share)
-        orbits = balance.solve(STRUCTURE, values, at, free=free, start=start)
+        orbits = balance.solve(STRUCTURE, values, at, start=start)
         assert orbits.converged.all()
         start = orbits.inputs
     plain = STRUCTURE.parameters.plain(values)
@@ -100,7 +100,7 @@ def test_no_effect_of_the_catalogue_stands_in_the_way() -> None:
         structure = STRUCTURE.with_effects(effect)
         inner = [q.to_internal(v) for q, v in zip(effect.parameters, neutral, strict=True)]
         whole = np.r_[theta(STRUCTURE), inner]
-        orbits = balance.solve(structure, whole, at, free=True)
+        orbits = balance.solve(structure, whole, at)
         assert orbits.converged.all(), effect.key
         cycle = Disturbed.around(
             structure, structure.parameters.plain(whole), at, orbits.omega, orbits.inputs

@@ -106,6 +106,8 @@ def _loop(structure: Structure, values: dict[str, float], frequency: FloatArray)
         time=0 * one,
         flame_on=one,
         identity=np.zeros(1, dtype=np.int64),
+        free=np.zeros(1, dtype=np.bool_),
+        spacing_m=one,
     )
     return structure.assemble(values, at, 2j * np.pi * frequency[None, :])
 

@@ -16,7 +16,7 @@ from identify.structure import Conditions, Effect, Known, Mode, Values
 
 def _upper_pressure(at: Conditions, s: Any) -> Any:
     """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
-    return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m) * at.velocity
+    return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
 
 
 def _add(at: Conditions, y: Any, leak: Any) -> Any:
@@ -25,12 +25,14 @@ def _add(at: Conditions, y: Any, leak: Any) -> Any:
     A free run's orbit has a phase of its own: it is turned first, so that its fundamental stands
     where the measured one stands without the leak.
     """
-    if not at.free:
+    if not at.free.any():
         return y + leak
     target = (at.velocity - leak)[:, :1]
     z = target * dual.conj(y[:, :1])
     unit = z / dual.sqrt((z * dual.conj(z)).real)
-    return y * dual.powers(unit, at.harmonics) + leak
+    free = at.free[:, None]
+    turn = dual.powers(unit, at.harmonics) * free + ~free
+    return y * turn + leak
 
 
 class ChannelMismatch(Effect):
@@ -75,7 +77,7 @@ class ChannelMismatch(Effect):
                 inverse = inverse * dual.exp(1j * value)
             else:
                 inverse = inverse * (s * value + 1.0)
-        leak = _upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m))
+        leak = _upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
         return _add(at, y, leak * (inverse - 1.0))
 
 
