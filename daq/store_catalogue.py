@@ -1,14 +1,15 @@
 """The catalogue: an SQLite index over the run files, which can be rebuilt from them at any time.
 
 The files are the truth; the catalogue only makes them quick to find. It runs in WAL mode, so that
-readers never wait for the writer, with one connection a thread. A page of runs is found by key
-(`after` is the last id of the page before), never by offset, so a page costs the same at run 10
-and at run 100 000.
+readers never wait for the writer, with a connection for each thread at work. A page of runs is
+found by key (`after` is the last id of the page before), never by offset, so a page costs the same
+at run 10 and at run 100 000.
 """
 
 import sqlite3
-import threading
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import astuple, dataclass, fields
 from operator import attrgetter
 from pathlib import Path
@@ -91,9 +92,9 @@ class Catalogue:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._local = threading.local()
-        self._connections: list[sqlite3.Connection] = []
-        self._connection()
+        self._idle: deque[sqlite3.Connection] = deque()
+        with self._connection():  # what cannot be opened says so at once
+            pass
 
     def add_runs(self, runs: Iterable[RunSummary]) -> None:
         """Insert or replace, in one transaction."""
@@ -155,42 +156,53 @@ class Catalogue:
         self._write("DELETE FROM campaigns", [()])
 
     def close(self) -> None:
-        """Close every thread's connection."""
-        for connection in self._connections:
-            connection.close()
-        self._connections.clear()
-        self._local = threading.local()
+        """Close the connections that no thread has in hand."""
+        while self._idle:
+            self._idle.pop().close()
 
-    def _connection(self) -> sqlite3.Connection:
-        connection: sqlite3.Connection | None = getattr(self._local, "connection", None)
-        if connection is None:
-            try:
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                connection = sqlite3.connect(self.path, timeout=30.0, check_same_thread=False)
-                connection.execute("PRAGMA journal_mode = WAL")
-                connection.execute("PRAGMA synchronous = NORMAL")
-                if connection.execute("PRAGMA user_version").fetchone()[0] != SCHEMA_VERSION:
-                    connection.executescript(_SCHEMA)
-            except (sqlite3.Error, OSError) as error:
-                raise StoreError(
-                    f"{self.path}: the catalogue cannot be opened ({error}); it holds nothing "
-                    "that the run files do not: remove it and run `entrain store rebuild`"
-                ) from error
-            self._local.connection = connection
-            self._connections.append(connection)
+    @contextmanager
+    def _connection(self) -> Iterator[sqlite3.Connection]:
+        """A connection for the length of a block, opened where none is idle.
+
+        As many stay open as were ever needed at once: threads come and go.
+        """
+        try:
+            connection = self._idle.pop()
+        except IndexError:
+            connection = self._opened()
+        try:
+            yield connection
+        except BaseException:
+            connection.close()
+            raise
+        self._idle.append(connection)
+
+    def _opened(self) -> sqlite3.Connection:
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            connection = sqlite3.connect(self.path, timeout=30.0, check_same_thread=False)
+            connection.execute("PRAGMA journal_mode = WAL")
+            connection.execute("PRAGMA synchronous = NORMAL")
+            if connection.execute("PRAGMA user_version").fetchone()[0] != SCHEMA_VERSION:
+                connection.executescript(_SCHEMA)
+        except (sqlite3.Error, OSError) as error:
+            raise StoreError(
+                f"{self.path}: the catalogue cannot be opened ({error}); it holds nothing "
+                "that the run files do not: remove it and run `entrain store rebuild`"
+            ) from error
         return connection
 
     def _write(self, statement: str, rows: Sequence[Sequence[object]]) -> None:
-        connection = self._connection()
         try:
-            with connection:
+            with self._connection() as connection, connection:
                 connection.executemany(statement, rows)
         except sqlite3.Error as error:
             raise StoreError(f"{self.path}: the catalogue cannot be written ({error})") from error
 
     def _read(self, statement: str, values: Sequence[object]) -> list[tuple[Any, ...]]:
         try:
-            return self._connection().execute(statement, values).fetchall()
+            with self._connection() as connection:
+                return connection.execute(statement, values).fetchall()
         except sqlite3.Error as error:
             raise StoreError(f"{self.path}: the catalogue cannot be read ({error})") from error
 

@@ -1,6 +1,8 @@
 """Run files: raw samples come back bit for bit, outcomes are honest, the catalogue is an index."""
 
 import hashlib
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import h5py
@@ -234,4 +236,27 @@ def test_pages_follow_each_other_and_filters_hold(tmp_path: Path) -> None:
     assert catalogue.count(query) == len(expected)
     query = RunQuery(campaign="c0001", since="2026-01-05", until="2026-01-06")
     assert {s.started_at for s in catalogue.runs(query)} == {"2026-01-05"}
+    catalogue.close()
+
+
+def test_threads_that_come_and_go_leave_no_connections_behind(tmp_path: Path) -> None:
+    path = tmp_path / "c.sqlite"
+    catalogue = Catalogue(path)
+    held = [fd for fd in Path("/proc/self/fd").iterdir() if fd.resolve() == path]
+    for _ in range(30):
+        thread = threading.Thread(target=catalogue.runs)
+        thread.start()
+        thread.join()
+    assert [fd for fd in Path("/proc/self/fd").iterdir() if fd.resolve() == path] == held
+    assert len(held) == 1
+
+
+def test_threads_at_once_read_while_one_writes(tmp_path: Path) -> None:
+    catalogue = Catalogue(tmp_path / "c.sqlite")
+    with ThreadPoolExecutor(8) as pool:
+        written = pool.map(lambda i: catalogue.add_runs([summary(i)]), range(60))
+        read = pool.map(lambda _: len(catalogue.runs()), range(60))
+        assert all(0 <= count <= 60 for count in read)
+        assert list(written) == [None] * 60
+    assert catalogue.count() == 60
     catalogue.close()
