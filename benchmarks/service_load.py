@@ -7,8 +7,9 @@ time, through the product's own acquisition, live pictures and run writer, and a
 after the other in the analysis lane. Another process holds the live clients (WebSocket), asks for
 pages at a fixed rate, and starts a second rig and presses its emergency stop, again and again.
 Printed: lost samples, times of answers and of the stop (and how many of these answers brought the
-rig's own word that it is silent), events dropped, processor time, and the service's memory at the
-start and its median in each quarter of the time (a soak is the same with ``--seconds 3600``).
+rig's own word that it is silent), events dropped, processor time, and the service's memory and
+open files at the start and their medians in each quarter of the time (a soak is the same with
+``--seconds 3600``).
 """
 
 import argparse
@@ -214,10 +215,15 @@ def memory_mb(pid: int) -> float:
     return int(line.split()[1]) / 1024
 
 
-def watch(pid: int, memory: list[float], over: threading.Event) -> None:
-    """Note the memory every half second."""
+def open_files(pid: int) -> int:
+    """Files and sockets that a process has open."""
+    return len(os.listdir(f"/proc/{pid}/fd"))
+
+
+def watch(pid: int, held: list[tuple[float, int]], over: threading.Event) -> None:
+    """Note memory and open files every half second."""
     while not over.wait(0.5):
-        memory.append(memory_mb(pid))
+        held.append((memory_mb(pid), open_files(pid)))
 
 
 def processor_s(pid: int) -> float:
@@ -239,7 +245,7 @@ def measure(
 
     Keys: `acquired` (what `benchmarks.acquire_load.acquire` returns), `reads`, `stops` (s),
     `silent`, `bytes`, `frames`, `dropped`, `gone`, `service_s` and `clients_s` (processor time),
-    `memory` (MB, every half second).
+    `held` (memory in MB and open files, every half second).
     """
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, str(ROOT / "benchmarks" / "service_load.py"), "--serve", folder]
@@ -251,10 +257,11 @@ def measure(
             hello = json.loads(server.stdout.readline())
             address, campaign = hello["address"], hello["campaign"]
             wait_for(address)
-            busy, memory = processor_s(server.pid), [memory_mb(server.pid)]
+            busy = processor_s(server.pid)
+            held = [(memory_mb(server.pid), open_files(server.pid))]
             mine = time.process_time()
             over = threading.Event()
-            watching = threading.Thread(target=watch, args=(server.pid, memory, over))
+            watching = threading.Thread(target=watch, args=(server.pid, held, over))
             watching.start()
             try:
                 seen = asyncio.run(load(address, campaign, clients, rate, seconds, not alone))
@@ -267,7 +274,7 @@ def measure(
         finally:
             server.terminate()
             server.wait(30)
-    return {**seen, "acquired": acquired, "service_s": busy, "clients_s": mine, "memory": memory}
+    return {**seen, "acquired": acquired, "service_s": busy, "clients_s": mine, "held": held}
 
 
 def main() -> None:
@@ -299,9 +306,10 @@ def main() -> None:
     print(f"processor       the service {100 * seen['service_s'] / seconds:.0f} % of a core, "
           f"the acquisition {100 * got['processor_share']:.0f} %, "
           f"the clients {100 * seen['clients_s'] / seconds:.0f} %")  # fmt: skip
-    memory = seen["memory"]
-    quarters = [f"{np.median(part):.0f}" for part in np.array_split(memory, 4)]
-    print(f"memory          {memory[0]:.0f} MB at first, {', '.join(quarters)} MB in the quarters")
+    for name, unit, row in (("memory", " MB", 0), ("open files", "", 1)):
+        values = [h[row] for h in seen["held"]]
+        quarters = [f"{np.median(part):.0f}{unit}" for part in np.array_split(values, 4)]
+        print(f"{name:<15} {values[0]:.0f}{unit} at first, {', '.join(quarters)} in the quarters")
 
 
 if __name__ == "__main__":

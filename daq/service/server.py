@@ -1,7 +1,5 @@
 """`entrain serve`: uvicorn around the application; going down, the speaker is silenced first."""
 
-import contextlib
-import ctypes
 import logging
 import socket
 import threading
@@ -15,7 +13,6 @@ from daq.service.settings import ConfigError, Settings
 from daq.service.state import Service
 
 log = logging.getLogger("entrain.service")
-M_ARENA_MAX = -8  # of glibc's malloc.h
 
 
 class Server(uvicorn.Server):
@@ -24,10 +21,6 @@ class Server(uvicorn.Server):
     def __init__(self, config: uvicorn.Config, service: Service) -> None:
         super().__init__(config)
         self.service = service
-
-    def run(self, sockets: list[socket.socket] | None = None) -> None:
-        few_arenas()
-        super().run(sockets)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         # A thread, since the signal may have interrupted a send on the same pipe.
@@ -38,16 +31,6 @@ class Server(uvicorn.Server):
         """Silence every rig and end the live streams."""
         self.service.closing = True
         self.service.control.stop(f"shutdown ({reason})")
-
-
-def few_arenas() -> None:
-    """Let the C library keep freed memory in two pools instead of one for every few threads.
-
-    Each pool keeps what its threads once needed, so that a service with many grows for hours. Only
-    glibc has them.
-    """
-    with contextlib.suppress(OSError, AttributeError):
-        ctypes.CDLL(None).mallopt(M_ARENA_MAX, 2)
 
 
 def check(settings: Settings, service: Service) -> None:
