@@ -66,8 +66,10 @@ class Comparison:
 
     @property
     def normalised(self) -> ComplexArray:
-        """(measured − predicted)/stderr, of order one where the model is right."""
-        return np.asarray((self.measured - self.predicted) / self.stderr)
+        """(measured − predicted)/stderr, of order one where the model is right and infinite where
+        it has no steady state."""
+        rest = self.measured - self.predicted
+        return np.asarray(rest.real / self.stderr + 1j * (rest.imag / self.stderr))
 
 
 @dataclass(frozen=True)

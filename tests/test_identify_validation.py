@@ -1,5 +1,6 @@
 """The fit judged by itself: residual tests, intervals, what is undetermined, uncertain drive."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from identify.fit import Fit, OrbitResidual, covariance_of, fit_orbits, levenber
 from identify.harmonics import VARIANCE_DOF
 from identify.identification import undetermined
 from identify.profile import intervals
+from identify.results import Comparison
 from identify.whiteness import residual_tests
 from tests.identify_coefficients import STRUCTURE, WIDE, clean, drawn, exact
 from tests.identify_rig import STEADY, true_values
@@ -98,3 +100,13 @@ def test_an_uncertain_drive_is_part_of_the_covariance() -> None:
     assert np.mean(after) == pytest.approx(VARIANCE_DOF / (VARIANCE_DOF - 2), abs=0.2)
     quiet = replace(data, fit=(replace(b, drive_noise=variance * 1e-6),))
     assert with_uncertain_drive(fit, quiet) is quiet
+
+
+def test_a_run_without_a_steady_state_is_infinitely_far_and_warns_of_nothing() -> None:
+    unsolved = Comparison(
+        "a", "free", "fit", 170.0, 170.0, None, 0.0, np.array([1 + 2j]), np.full(1, np.inf + 0j),
+        np.ones(1),
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isinf(np.abs(unsolved.normalised)).all()
