@@ -72,16 +72,18 @@ def diagnose(
     recorded = ready.data
     data, fit = drive.refitted(start.fit_from_data(ready.structure, recorded), recorded)
     ready = replace(ready, data=data)
-    declared = _declared(fit, ready, catalogue)
+    run = executor or InProcess()
+    declared = _declared(fit, ready, catalogue, run)
     tried: list[Tried] = []
     if declared.significant:
         found = trace.search(
             ready.structure,
             data,
             declared.fit,
-            executor=executor,
+            executor=run,
             progress=lambda share, text: report(0.15 + 0.8 * share, text),
             catalogue=catalogue,
+            scores=declared.scores or None,
         )
         tried = list(found.tried)
         known = [t for t in tried if t.plausible and t.fit.converged]
@@ -91,12 +93,12 @@ def diagnose(
             better, fit = drive.refitted(declared.fit, recorded, best.fit)
             if better is not recorded:
                 data, ready = better, replace(ready, data=better)
-                declared = _declared(fit, ready, catalogue)
+                declared = _declared(fit, ready, catalogue, run)
                 tried = trace.refitted(tried, data)
         # what an effect explains, a better start of the declared model may explain without it
         once_more = trace.without_effects(ready.structure, data, tried)
         if once_more is not None and _better(once_more, declared.fit):
-            declared = _declared(once_more, ready, catalogue)
+            declared = _declared(once_more, ready, catalogue, run)
     base, before = declared.fit, declared.assessment
     tones = _tone_effects(ready.quality.tones)
     residual = Residual(
@@ -109,7 +111,7 @@ def diagnose(
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
     after = before if chosen is None else assess.assess(chosen.fit, data)
-    before, after = _with_lock_in(before, after, data, executor or InProcess())
+    before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
     effects = (*_traced(chosen, tried), *tones) if claimed and chosen else tuple(tones)
     report(1.0, "done")
@@ -157,10 +159,14 @@ class _Declared:
         return self.p_value < ALPHA
 
 
-def _declared(fit: Fit, ready: Prepared, catalogue: Sequence[Effect]) -> _Declared:
-    assessment = assess.assess(fit, ready.data)
-    scores = _scores(ready.structure, ready.data, assessment, catalogue)
-    held = _validation_p(assessment, ready.data)
+def _declared(
+    fit: Fit, ready: Prepared, catalogue: Sequence[Effect], executor: Executor
+) -> _Declared:
+    structure, data = ready.structure, ready.data
+    assessment = assess.assess(fit, data)
+    usable = [e for e in catalogue if trace.usable(e, data, structure)] if fit.converged else []
+    scores = trace.score_tests(structure, data, fit, usable, executor)
+    held = _validation_p(assessment, data)
     p_value = min(
         assess.lack_of_fit_p(fit.chi2, fit.dof),
         held if np.isfinite(held) else 1.0,
@@ -172,16 +178,6 @@ def _declared(fit: Fit, ready: Prepared, catalogue: Sequence[Effect]) -> _Declar
 def _validation_p(before: Assessment, data: Dataset) -> float:
     held = [assess.predict(before.structure, before.fit.theta, b) for b in data.validation]
     return assess.validation_p(held, before.fit.covariance) if held else float("nan")
-
-
-def _scores(
-    structure: Structure, data: Dataset, before: Assessment, catalogue: Sequence[Effect]
-) -> dict[str, trace.ScoreTest]:
-    if not before.fit.converged:
-        return {}
-    usable = [e for e in catalogue if trace.usable(e, data, structure)]
-    found = {e.key: trace.score_test(structure, data, before.fit, e) for e in usable}
-    return {k: s for k, s in found.items() if s is not None}
 
 
 def signature(assessment: Assessment, scores: Mapping[str, trace.ScoreTest]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ Selection is by lack of fit and held-out runs with corrected significance; infor
 only weigh candidates that are adequate already.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -192,6 +192,18 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     return ScoreTest(drop, step, share, chi2_tail(drop, basis.shape[1]), basis)
 
 
+def score_tests(
+    structure: Structure, data: Dataset, fit: Fit, effects: Sequence[Effect], executor: Executor
+) -> dict[str, ScoreTest]:
+    """Score tests by the effects' keys, of those that have one."""
+    found = executor.map(_score, [(structure, data, fit, e) for e in effects])
+    return {e.key: s for e, s in zip(effects, found, strict=True) if s is not None}
+
+
+def _score(item: tuple[Structure, Dataset, Fit, Effect]) -> ScoreTest | None:
+    return score_test(*item)
+
+
 def family_p(scores: Sequence[ScoreTest], seed: int = 0) -> float:
     """How probable it is that noise alone makes the most extreme of all score tests as extreme.
 
@@ -228,6 +240,7 @@ class _Task:
     effect: Effect
     known: Known
     shares: tuple[float, float, float]  # of each coefficient's size that count as noise, by stage
+    score: ScoreTest | None
     placements: tuple[tuple[float, ...], ...] = ()
 
     @property
@@ -251,10 +264,9 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
     if neutral is not None:  # never worse than without the effect
         still = [q.to_internal(v) for q, v in zip(own, neutral, strict=True)]
         thetas.append(np.r_[task.base.theta, still])
-    score = score_test(task.structure, task.data, task.base, task.effect)
-    if score is not None:
+    if task.score is not None:
         bound = 20 * np.max(np.abs(inner), axis=0) + 1e-12
-        thetas.append(np.r_[task.base.theta, np.clip(score.size, -bound, bound)])
+        thetas.append(np.r_[task.base.theta, np.clip(task.score.size, -bound, bound)])
     first = task.shares[0]
     starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
     richer = None if task.structure.effects else task.effect.restated(task.structure)
@@ -334,15 +346,21 @@ def try_effects(
     keep: int,
     far: bool,
     progress: Callable[[float, str], None],
+    scores: Mapping[str, ScoreTest] | None = None,
 ) -> list[Tried]:
     """Each effect added to `structure`; the best `keep` are refitted in full, best first.
 
     Started near the `base` fit; with `far` from the slow flow too, where none comes of that.
+    `scores` are the effects' tests at the base fit, where they are known already.
     """
+    if scores is None:
+        scores = score_tests(structure, data, base, effects, executor)
     known = known_sizes(data, base)
     rough = data.coarse()
     shares = _shares(base, data)
-    tasks = [_Task(structure, data, rough, base, e, known, shares) for e in effects]
+    tasks = [
+        _Task(structure, data, rough, base, e, known, shares, scores.get(e.key)) for e in effects
+    ]
     staged: list[tuple[_Task, list[CoarseStart]]] = []
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
         staged.append((task, starts))
@@ -523,8 +541,12 @@ def search(
     progress: Progress | None = None,
     catalogue: Sequence[Effect] = CANDIDATES,
     depth: int = 3,
+    scores: Mapping[str, ScoreTest] | None = None,
 ) -> Search:
-    """Forward selection of up to `depth` effects with backward elimination."""
+    """Forward selection of up to `depth` effects with backward elimination.
+
+    `scores` are the candidates' tests at the base fit, where they are known already.
+    """
     run = executor or InProcess()
     report = progress or (lambda share, text: None)
     scatters = [e for e in catalogue if isinstance(e, Scatter)]
@@ -538,6 +560,7 @@ def search(
         keep=8,
         far=base.chi2_per_dof > GROSS,
         progress=lambda share, text: report(0.6 * share, text),
+        scores=scores,
     )
     if not any(t.adequate for t in singles) and base.chi2_per_dof > GROSS:
         report(0.6, "starting the best once more from afar")
