@@ -292,14 +292,24 @@ def _candidates(
     tried: Sequence[Tried], chosen: Tried | None, base_chi2: float, base_parameters: int
 ) -> tuple[Candidate, ...]:
     ordered = trace.best_by_name(tried)
-    good = [t for t in ordered if t.explains]
     if chosen is not None:  # what the verdict rests on stands first
         ordered = [chosen, *(t for t in ordered if t.key != chosen.key)]
+    good = [t for t in ordered if t.explains]
     out = []
     for t in ordered[:SHOWN]:
-        equal = [" + ".join(o.names) for o in trace.rivals(t, good)] if t in good else []
+        alike = [o for o in good if t.explains and o is not t and _alike(t, o, chosen)]
+        equal = [" + ".join(o.names) for o in alike]
         out.append(trace.candidate(t, base_chi2, base_parameters, len(CATALOGUE), equal))
     return tuple(out)
+
+
+def _alike(a: Tried, b: Tried, chosen: Tried | None) -> bool:
+    """Whether the data do not tell two explanations apart: for the one that the verdict rests on
+    as the verdict has it, else each by the other's measure. What merely extends the other is no
+    equal of it."""
+    if chosen is a or chosen is b:
+        return bool(trace.rivals(chosen, [b if chosen is a else a]))
+    return bool(trace.rivals(a, [b]) and trace.rivals(b, [a]))
 
 
 def _traced(chosen: Tried, tried: Sequence[Tried]) -> tuple[TracedEffect, ...]:

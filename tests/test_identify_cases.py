@@ -56,6 +56,8 @@ def test_case_is_diagnosed(name: str) -> None:
         assert found.effects == ()
         return
     assert found.verdict == "traced", found.explanation
+    # no rival remains: a distributed delay without spread is the delay itself, not its equal
+    assert not any(c.equivalent_to for c in found.candidates if c.adequate)
     assert [(e.effect, e.location) for e in found.effects] == [expected[:2]]
     assert told["before"]["validation_error"] > 5 * told["after"]["validation_error"]
     for parameter, value in expected[2].items():

@@ -198,7 +198,7 @@ def describe(event: Event) -> str:
     data = event.data
     where = "" if event.index is None else f"condition {event.index}: "
     if event.kind == "free":
-        return f"free run: {data['frequency_hz']:.2f} Hz, amplitude {data['amplitude']:.4g}"
+        return f"free run: {data['frequency_hz']:.2f} Hz, amplitude {data['amplitude']:.4g} Pa"
     if event.kind == "review":
         return f"{where}{_reviewed(data)}"
     if event.kind == "operating_point":

@@ -15,6 +15,7 @@ from daq.service.commands.common import (
     HtmlOption,
     JsonOption,
     StoreOption,
+    chance,
     number,
     open_store,
     out,
@@ -259,14 +260,14 @@ def show_diagnosis(found: "Diagnosis") -> None:
     if found.candidates:
         table(
             "candidates, best first",
-            ("effects", "where", "χ²/dof", "validation error", "p"),
+            ("effects", "where", "χ²/dof", "validation error", "p of the gain"),
             (
                 (
                     " + ".join(c.effects),
                     ", ".join(c.locations),
                     number(c.chi2_per_dof),
                     number(c.validation_error, 3),
-                    number(c.p_value, 2),
+                    chance(c.p_value),
                 )
                 for c in found.candidates[:8]
             ),

@@ -29,6 +29,9 @@ export function num(value, digits = 4) {
   return String(Number(value.toPrecision(digits)));
 }
 
+// a probability; what is too small for a double is said so
+export function chance(p) { return p !== null && p < 1e-300 ? "< 1e-300" : num(p, 3); }
+
 export function table(caption, head, rows, { pick, numeric = [], empty = "nothing yet" } = {}) {
   const body = rows.map((row, i) => {
     const cells = row.map((cell, k) => h("td", { class: numeric.includes(k) ? "n" : null }, cell ?? "–"));

@@ -136,19 +136,22 @@ export class Portrait {
   constructor(label) {
     this.canvas = h("canvas", { class: "free", role: "img", "aria-label": label, height: 230 });
   }
-  draw(xs, ys) {
+  draw(xs, ys, name, unit) {
     const { canvas } = this, width = canvas.clientWidth || 230, height = 230;
     const ratio = devicePixelRatio || 1;
     canvas.width = width * ratio; canvas.height = height * ratio; canvas.style.height = `${height}px`;
     const ctx = canvas.getContext("2d");
     ctx.scale(ratio, ratio);
-    const top = Math.max(1e-12, ...xs.map(Math.abs)), right = Math.max(1e-12, ...ys.map(Math.abs));
+    const reach = Math.max(1e-12, ...xs.map(Math.abs), ...ys.map(Math.abs)); // one scale for both
     const side = Math.min(width, height) / 2 - 12;
     ctx.strokeStyle = css("--grid");
     ctx.beginPath(); ctx.moveTo(width / 2, 4); ctx.lineTo(width / 2, height - 4); ctx.moveTo(width / 2 - side, height / 2); ctx.lineTo(width / 2 + side, height / 2); ctx.stroke();
+    ctx.fillStyle = css("--soft"); ctx.font = "11px system-ui";
+    ctx.fillText("¼ period earlier", width / 2 + 5, 13);
+    ctx.textAlign = "right"; ctx.fillText(`${name} ${num(reach, 3)} ${unit}`, width - 2, height / 2 - 5);
     ctx.strokeStyle = css("--c1"); ctx.lineWidth = 1.2; ctx.beginPath();
     for (let i = 0; i < xs.length; i++) {
-      const px = width / 2 + xs[i] / top * side, py = height / 2 - ys[i] / right * side;
+      const px = width / 2 + xs[i] / reach * side, py = height / 2 - ys[i] / reach * side;
       if (i) ctx.lineTo(px, py); else ctx.moveTo(px, py);
     }
     ctx.stroke();

@@ -1,6 +1,6 @@
 // Diagnosis: verdict, error before and after, residual by harmonic and condition, candidates, next experiment.
 import { attempt, get, post } from "../api.js";
-import { card, h, num, table } from "../dom.js";
+import { card, chance, h, num, table } from "../dom.js";
 import { curveCards, parameterTable, plusMinus, reportLinks } from "./identification.js";
 
 const WORDS = {
@@ -40,11 +40,11 @@ export async function drawDiagnosis(job) {
       d.effects.map((e) => h("div", {}, h("h3", {}, `${e.effect} (${e.location})`), h("dl", {}, Object.entries(e.parameters).flatMap(([name, p]) => [h("dt", {}, name), h("dd", {}, `${plusMinus(p)} ${p.unit}`)])))),
       d.explanation ? h("p", {}, d.explanation) : "", reportLinks({ "HTML report": `/diagnoses/${job.id}/report`, JSON: `/diagnoses/${job.id}` })),
     card("w7", "Error before and after", table("", ["", "before", "after"], [pair("validation error", "validation_error"), pair("fit error", "fit_error"), pair("χ² per degree of freedom", "chi2_per_dof", 4), ["noise floor", num(d.noise_floor, 3), num(d.noise_floor, 3)]], { numeric: [1, 2] }),
-      h("p", { class: "soft" }, `Residual before: ${d.residual.significant ? "significant" : "within noise"}, p ${d.residual.p_value === 0 ? "< 1e-300" : `= ${num(d.residual.p_value, 3)}`}. ${num(d.seconds, 3)} s.`)),
+      h("p", { class: "soft" }, `Residual before: ${d.residual.significant ? "significant" : "within noise"}, p ${chance(d.residual.p_value).replace(/^(?!<)/, "= ")}. ${num(d.seconds, 3)} s.`)),
     card("w6", "Residual before", heat("Measured less modelled by harmonic, in standard errors", detail.before)),
     card("w6", "Residual after", heat("Measured less modelled by harmonic, in standard errors", detail.after)),
-    card("", "Candidates, best first", table("", ["effects", "where", "χ²/dof", "validation error", "p", "parameters", "remarks"], d.candidates.map((c) => [
-      c.effects.join(" + "), c.locations.join(", "), num(c.chi2_per_dof, 4), num(c.validation_error, 3), num(c.p_value, 2), Object.entries(c.parameters).map(([k, p]) => `${k} = ${plusMinus(p)} ${p.unit}`).join("; "),
+    card("", "Candidates, best first", table("", ["effects", "where", "χ²/dof", "validation error", "p of the gain", "parameters", "remarks"], d.candidates.map((c) => [
+      c.effects.join(" + "), c.locations.join(", "), num(c.chi2_per_dof, 4), num(c.validation_error, 3), chance(c.p_value), Object.entries(c.parameters).map(([k, p]) => `${k} = ${plusMinus(p)} ${p.unit}`).join("; "),
       [c.plausible ? "" : "implausible", c.equivalent_to.length ? `not told apart from ${c.equivalent_to.join(", ")}` : "", c.note || ""].filter(Boolean).join("; ")]), { numeric: [2, 3, 4], empty: "none was needed" })),
     card("", "Next experiment", next ? [h("p", {}, next.reason || next.why || "What to measure to tell the rivals apart:"), h("pre", { class: "scroll", tabindex: "0" }, JSON.stringify(next, null, 1)), h("button", { type: "button", class: "primary", onclick: run }, "Run it")] : h("p", {}, "None is needed.")),
     card("w6", "Parameters before", parameterTable("", d.before.parameters)),

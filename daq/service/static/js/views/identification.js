@@ -27,7 +27,7 @@ export function curveCards(curves) {
       points: [{ x: 1, y: 0, colour: "--bad", cross: true, label: "critical point +1 (positive feedback)" }, { x: loop[at][0], y: loop[at][1], colour: "--c3", label: `limit cycle, ${num(curves.free_hz, 6)} Hz` }] }),
       h("p", { class: "soft" }, "Cross: critical point +1. Dot: at the limit cycle's frequency.")),
     card("w4", "Loop gain", scatter({ label: "Loop gain against frequency with 95 % band", width: 400, x: "frequency (Hz)", y: "dB", points: [], height: 320, lines: [{ points: curves.frequency_hz.map((f, i) => [f, curves.gain_db.value[i]]), colour: "--c1" }], bands: [{ points: bands(curves.frequency_hz, curves.gain_db), colour: "--c1" }] })),
-    card("w4", "Nonlinearity", scatter({ label: "Flame output against flame input with 95 % band", width: 400, x: "flame input w", y: "flame output N(w)", points: [], height: 320,
+    card("w4", "Nonlinearity", scatter({ label: "Flame output against flame input with 95 % band", width: 400, x: "flame input w (m)", y: "flame output N(w) (m)", points: [], height: 320,
       lines: [{ points: curves.flame_input.map((w, i) => [w, curves.flame_output.value[i]]), colour: "--c2", label: "N(w)" }, { points: curves.flame_input.map((w) => [w, w]), colour: "--soft", dash: true, label: "linear" }], bands: [{ points: bands(curves.flame_input, curves.flame_output), colour: "--c2" }] }),
       h("p", { class: "soft" }, "Over the range that the free limit cycle reaches; dashed: linear.")),
   ];

@@ -120,7 +120,7 @@ export default async function live([wanted]) {
     gaugeText.textContent = level === undefined || level === null ? "–" : `${level.toFixed(1)} dB`;
     gaugeText.className = `big ${level <= CRITERION_DB ? "good" : ""}`;
     const pairs = [
-      ["free limit cycle", seen.free ? `${num(seen.free.frequency_hz, 6)} Hz, ${num(seen.free.amplitude)}` : "–"],
+      ["free limit cycle", seen.free ? `${num(seen.free.frequency_hz, 6)} Hz, ${num(seen.free.amplitude)} Pa` : "–"],
       ["forcing", seen.window ? `${num(seen.window.frequency_hz, 6)} Hz at ${num(seen.window.drive_v, 3)} V` : "–"],
       ["phase", seen.window ? `${num(seen.window.phase_deg, 3)}° (${seen.window.phase})` : "–"],
       ["threshold", seen.window?.threshold_v ? `${num(seen.window.threshold_v, 3)}${seen.window.threshold_sigma_v ? ` ± ${num(seen.window.threshold_sigma_v, 2)}` : ""} V` : "–"],
@@ -149,7 +149,7 @@ export default async function live([wanted]) {
     wave.set([time, a, b]);
     const beat = rig().window?.frequency_hz ?? rig().free?.frequency_hz ?? 170;
     const lag = Math.max(1, Math.round(event.rate_hz / beat / 4));
-    portrait.draw([...a.slice(lag)], [...a.slice(0, -lag)]);
+    portrait.draw([...a.slice(lag)], [...a.slice(0, -lag)], event.channels[chosen[0]], event.units[chosen[0]]);
   }
   function drawSpectrum(event) {
     const [rows, columns] = event.shape;

@@ -24,7 +24,7 @@ export async function drawLoop(job) {
   return h("div", { class: "grid" },
     card("", "Verdict", h("p", { class: `verdict ${tone}`, id: "verdict", "data-verdict": last?.verdict ?? closed.ending }, words),
       last?.effects.length ? h("h3", {}, last.effects.join(" + ")) : "", h("p", {}, closed.reason),
-      h("p", { class: "soft" }, `${closed.rounds.length} rounds, ${num(closed.rig_seconds / 60, 3)} minutes of rig time`),
+      h("p", { class: "soft" }, `${closed.rounds.length} ${closed.rounds.length === 1 ? "round" : "rounds"}, ${num(closed.rig_seconds / 60, 3)} minutes of rig time`),
       last ? reportLinks({ "HTML report": `/close-loops/${job.id}/report`, JSON: `/jobs/${job.id}/result` }) : ""),
     card("", "Rounds", table("Error before and after, by round", ["#", "campaign", "runs", "verdict", "effects", "rivals", "χ²/dof", "validation error"], closed.rounds.map((one) => [
       one.number, h("a", { href: `#campaign/${one.campaign}` }, one.campaign), one.runs, one.verdict, one.effects.join(", "), one.rivals.join(", "),
