@@ -46,6 +46,7 @@ SHARES = (1e-3, 1e-2, 0.0)  # share of a coefficient's size that its weight coun
 SCAN = 24  # assumed flame poles
 DENSE = 24  # starts that are polished where sparser ones led nowhere
 NEARLY = 100.0  # χ²/dof beyond which the model is to blame, not a mode at the wrong place
+FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
 
 @dataclass(frozen=True)
@@ -529,7 +530,8 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
     A start of the polynomial balance that reaches the noise (χ² within five standard deviations
     of its expectation) settles it. Otherwise all kinds of start are led in side by side: those of
     the polynomial balance, exact where the model is, and of the slow flow, robust where it is not.
-    Where that ends near the noise but not at it, the other modes are placed more densely.
+    Where that ends near the noise but not at it, or the runs are few, the other modes are placed
+    more densely.
     """
     starts = coarse(structure, data, candidates(structure, data))
     for start in starts[:1]:  # the polynomial balance is exact where the model is: try it first
@@ -544,7 +546,8 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
         return failed(structure, data, np.zeros(p), "no start exists for these data")
     thetas = np.stack([s.theta for s in polished[:4]])
     fit = fit_orbits(structure, data, thetas, continuation=(0.003, 0.0), iterations=120)
-    if structure.mode_count < 2 or _adequate(fit) or fit.chi2_per_dof > NEARLY:
+    hopeless = fit.chi2_per_dof > NEARLY and fit.dof >= FEW * fit.theta.size
+    if structure.mode_count < 2 or _adequate(fit) or hopeless:
         return fit
     again = _replaced(structure, data, rough, fit)
     return min((fit, *again), key=lambda f: (not f.converged, f.chi2))
