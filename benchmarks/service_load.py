@@ -161,7 +161,10 @@ async def reader(
 async def stopper(url: str, until: float, times: list[float], silent: list[bool]) -> None:
     """Stop a rig that runs (in real time, in a process of its own), and start it again."""
     rig = "/rigs/simulated"
-    async with httpx.AsyncClient(base_url=f"{url}/api/v1", timeout=30, trust_env=False) as client:
+    fresh = httpx.Limits(max_keepalive_connections=0)  # a kept one may be closed as it is used
+    async with httpx.AsyncClient(
+        base_url=f"{url}/api/v1", timeout=30, trust_env=False, limits=fresh
+    ) as client:
         while time.monotonic() < until:
             watch = await client.post(f"{rig}/watch", json={"seconds": 3600})
             job = f"/jobs/{watch.json()['id']}"
