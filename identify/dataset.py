@@ -33,7 +33,6 @@ class Batch:
     `names` and `rows` identify the runs within the campaign; `noise` (runs, K) is E|n|².
     """
 
-    free: bool
     names: tuple[str, ...]
     at: Conditions
     measured: ComplexArray
@@ -48,6 +47,11 @@ class Batch:
     @property
     def runs(self) -> int:
         return len(self.names)
+
+    @property
+    def free(self) -> bool:
+        """Whether these are free runs; like kind means all or none."""
+        return bool(self.at.free.all())
 
     @property
     def compared(self) -> int:
@@ -98,7 +102,7 @@ class Batch:
             omega=np.full(self.runs, omega),
             drive=np.zeros_like(self.at.drive),
         )
-        return replace(self, free=True, at=at)
+        return replace(self, at=at)
 
 
 @dataclass(frozen=True)
@@ -210,7 +214,6 @@ def _batch(
             [free_covariance(c, y, s) for c, y, s in zip(covariance, measured, stderr, strict=True)]
         )
     return Batch(
-        free=free,
         names=tuple(h.name for h in hs),
         at=at,
         measured=measured,

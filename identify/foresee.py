@@ -268,7 +268,6 @@ def _batch(options: Sequence[Option], ready: Prepared, reference: Fit, misfit: f
             [free_covariance(c, y, s) for c, y, s in zip(covariance, measured, stderr, strict=True)]
         )
     return Batch(
-        free=free,
         names=tuple(o.words() for o in options),
         at=at,
         measured=measured,

@@ -5,13 +5,15 @@ loop gain, 1 at the brink of oscillation; N the static characteristic over the r
 limit cycle reaches. Bands come from `DRAWS` parameter sets drawn from the fit's covariance.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from identify.results import Assessment, Comparison
-from identify.structure import Conditions, Loop, Structure
+from identify.statespace import standing_still
+from identify.structure import Loop, Structure
 
 FloatArray = npt.NDArray[np.float64]
 DRAWS = 60
@@ -96,19 +98,8 @@ def _grid(values: dict[str, float], free_hz: float) -> FloatArray:
 
 
 def _loop(structure: Structure, values: dict[str, float], frequency: FloatArray) -> Loop:
-    n = frequency.size
-    one, zero = np.ones(1), np.zeros((1, n), dtype=np.complex128)
-    at = Conditions(
-        omega=2 * np.pi * one,
-        drive=np.ones((1, n), dtype=np.complex128),
-        pressure=zero,
-        velocity=zero,
-        time=0 * one,
-        flame_on=one,
-        identity=np.zeros(1, dtype=np.int64),
-        free=np.zeros(1, dtype=np.bool_),
-        spacing_m=one,
-    )
+    unit = np.ones((1, frequency.size), dtype=np.complex128)
+    at = replace(standing_still(), drive=unit)
     return structure.assemble(values, at, 2j * np.pi * frequency[None, :])
 
 
