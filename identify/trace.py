@@ -254,12 +254,43 @@ class _Task:
         return [tuple(row) for row in self.effect.starts(self.known)]
 
 
+def _louder(theta: FloatArray, names: Sequence[str], gain: float) -> FloatArray:
+    """Unknowns of these names, the speaker `gain` times as loud."""
+    spoken = [n.endswith("speaker_residue") for n in names]
+    return np.where(spoken, theta * gain, theta)
+
+
+def _loudness(data: Dataset, effects: Sequence[Effect], p: Mapping[str, float]) -> float:
+    """What effects of these values make of the drive at the free frequency: a factor whose sign
+    is that of its real part (a resonance below it turns the sign), 1 where it says nothing."""
+    at = data.fit[0].at.take(np.array([0]))
+    s = np.array([[2j * np.pi * data.free_hz]])
+    gain = complex(np.prod([np.ravel(e.actuator(p, at, s))[0] for e in effects]))
+    signed = float(np.copysign(abs(gain), gain.real))
+    return signed if np.isfinite(signed) and signed != 0 else 1.0
+
+
+def _beside(
+    structure: Structure,
+    theta: FloatArray,
+    data: Dataset,
+    effect: Effect,
+    values: Sequence[float],
+) -> FloatArray:
+    """Unknowns of `structure` as they are with one more effect of these values: as loud."""
+    p = {q.name: v for q, v in zip(effect.parameters, values, strict=True)}
+    return _louder(theta, structure.parameters.names, 1 / _loudness(data, [effect], p))
+
+
 def _first_stage(task: _Task) -> list[CoarseStart]:
     """The best starts of one effect near the base fit at the first share of noise, best first."""
     larger = task.structure.with_effects(task.effect)
     own = task.effect.parameters
     inner = [[q.to_internal(v) for q, v in zip(own, row, strict=True)] for row in task.proposals]
-    thetas = [np.r_[task.base.theta, row] for row in inner]
+    thetas = [
+        np.r_[_beside(task.structure, task.base.theta, task.data, task.effect, values), row]
+        for values, row in zip(task.proposals, inner, strict=True)
+    ]
     neutral = task.effect.neutral()
     if neutral is not None:  # never worse than without the effect
         still = [q.to_internal(v) for q, v in zip(own, neutral, strict=True)]
@@ -303,20 +334,27 @@ def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     larger = task.structure.with_effects(task.effect)
     thetas = np.stack([s.theta for s in starts])
     fit = fit_orbits(larger, task.data, thetas, continuation=(task.shares[2], 0.0))
-    return _canonical(task, fit)
+    return _canonical(fit, task.data)
 
 
-def _canonical(task: _Task, fit: Fit) -> Fit:
-    """The same fit with its effect's parameters named by the effect's own rule."""
-    effect = task.effect
-    if not fit.converged or task.structure.effects or effect.restated(task.structure) is None:
-        return fit
-    values = effect.from_restated(task.structure, effect.to_restated(task.structure, fit.values))
-    theta = fit.structure.parameters.to_internal(values)
-    if np.allclose(theta, fit.theta, rtol=1e-9, atol=1e-12):
-        return fit
-    renamed = fit_orbits(fit.structure, task.data, theta, continuation=(0.0,))
-    return renamed if renamed.converged else fit
+def _canonical(fit: Fit, data: Dataset) -> Fit:
+    """The same fit with its effects' parameters named by the effects' own rules."""
+    structure = fit.structure
+    plain = replace(structure, effects=())
+    for effect in structure.effects:
+        if not fit.converged or effect.restated(plain) is None:
+            continue
+        named = effect.from_restated(plain, effect.to_restated(plain, fit.values))
+        names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
+        values = {**fit.values, **dict(zip(names, named, strict=True))}
+        theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+        if np.allclose(theta, fit.theta, rtol=1e-9, atol=1e-12):
+            continue
+        renamed = fit_orbits(structure, data, theta, continuation=(0.0,))
+        # beside an effect that speaks of the modes by number, another name is another model
+        if renamed.converged and renamed.chi2 < fit.chi2 + 1.0:
+            fit = renamed
+    return fit
 
 
 def _shares(base: Fit, data: Dataset) -> tuple[float, float, float]:
@@ -565,7 +603,8 @@ def search(
     if not any(t.adequate for t in singles) and base.chi2_per_dof > GROSS:
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
-    everything = [*singles, *_other_forms(singles, structure, data, available)]
+    singles = [*singles, *_other_forms(singles, data, available)]
+    everything = list(singles)
     if not any(t.explains for t in everything):
         report(0.6, "trying run-to-run scatter")
         everything += try_scatters(structure, data, base, scatters)
@@ -607,58 +646,79 @@ def _in_their_places(
     """Other effects in the place of each of several that explain the data together.
 
     The set was grown from one of them, so that only the places of the others have been contested.
+    One effect in the place of them all is sought too, from what they say of the declared model.
     `extended` are the sets (of keys, sorted) that have been grown from already.
     """
     good = [t for t in tries if t.explains and t.spread is None]
     if not good:
         return []
     best = best_form(good)
-    rest = [a for a in available if a.name not in best.names]
+    if len(best.effects) == 1:
+        return []
+    kept = [tuple(o for o in best.effects if o is not e) for e in best.effects]
+    new = [k for k in kept if tuple(sorted(o.key for o in k)) not in extended]
+    bases = [_with_fewer(best, others, data) for others in new]
     out: list[Tried] = []
-    for e in best.effects:
-        others = tuple(o for o in best.effects if o is not e)
-        if tuple(sorted(o.key for o in others)) in extended:
+    for base in [*bases, _without(best, (), data)]:
+        if not np.isfinite(base.chi2):
             continue
-        base = _with_fewer(best, others, data)
-        if np.isfinite(base.chi2):
-            out += try_effects(
-                base.structure, data, base, rest, executor=run, keep=5, far=False,
-                progress=lambda share, text: report(0.95 + 0.05 * share, text),
-            )  # fmt: skip
+        alone = not base.structure.effects
+        out += try_effects(
+            base.structure, data, base,
+            [a for a in available if alone or a.name not in best.names],
+            executor=run, keep=5, far=False, scores={} if alone else None,
+            progress=lambda share, text: report(0.95 + 0.05 * share, text),
+        )  # fmt: skip
     return out
 
 
 def _other_forms(
-    singles: Sequence[Tried], structure: Structure, data: Dataset, available: Sequence[Effect]
+    singles: Sequence[Tried], data: Dataset, available: Sequence[Effect]
 ) -> list[Tried]:
-    """The other forms of the best adequate effect, started from where it ended.
+    """The other forms of the best single effect, started from where it ended.
 
-    A form with one parameter less may do as well, and is then what should be named.
+    A form with one parameter less may do as well, and is then what should be named; where none
+    explains the data, another may be nearer to the truth than the one that was refitted first.
     """
     good = [t for t in singles if t.explains]
-    if not good:
+    best = min(good, key=lambda t: t.evidence) if good else min(singles, key=_misfit, default=None)
+    if best is None:
         return []
-    best = min(good, key=lambda t: t.evidence)
+    base = _without(best, (), data)
     known = known_sizes(data, best.fit)
-    base = best.fit.theta[: len(structure.parameters)]
-    done = {t.effects[-1].key for t in singles if t.adequate}
+    done = {t.effects[-1].key for t in singles if t.adequate} | {best.effects[-1].key}
     out = []
     for e in available:
         if e.name != best.effects[-1].name or e.key in done:
             continue
-        larger = structure.with_effects(e)
-        rows = [
-            [q.to_internal(v) for q, v in zip(e.parameters, row, strict=True)]
-            for row in e.starts(known)
+        larger = base.structure.with_effects(e)
+        rows = e.starts(known)
+        if [q.name for q in e.parameters] == [q.name for q in best.effects[-1].parameters]:
+            rows = [*rows, tuple(best.fit.values[q.name] for q in e.parameters)]
+        thetas = [
+            np.r_[
+                _beside(base.structure, base.theta, data, e, row),
+                [q.to_internal(v) for q, v in zip(e.parameters, row, strict=True)],
+            ]
+            for row in rows
         ]
-        found = coarse(larger, data, [np.r_[base, row] for row in rows])[:2]
+        found = coarse(larger, data, thetas)[:2]
         if not found:
             continue
         starts = np.stack([s.theta for s in found])
         fit = fit_orbits(larger, data, starts, continuation=(0.003, 0.0), iterations=30)
         if np.isfinite(fit.chi2):
-            out.append(tried((*structure.effects, e), fit, data))
+            out.append(tried((e,), fit, data))
     return out
+
+
+def _without(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
+    """The values of `t` with only some of its effects, not fitted again: as loud as with all."""
+    structure, values = replace(t.fit.structure, effects=effects), t.fit.values
+    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+    left = [e for e in t.effects if e not in effects]
+    theta = _louder(theta, structure.parameters.names, _loudness(data, left, values))
+    return replace(t.fit, structure=structure, theta=theta)
 
 
 def _with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
@@ -725,8 +785,11 @@ def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
 
 
 def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
-    """Adequate, plausible sets of other effects that the data do not rule out against `best`."""
-    return [
+    """Adequate, plausible sets of other effects that the data do not rule out against `best`.
+
+    What only adds an effect to one of them is none of its own.
+    """
+    found = [
         t
         for t in others
         if t.key != best.key
@@ -735,6 +798,7 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         and not set(best.names) < set(t.names)
         and not _extends(t, best)
     ]
+    return [t for t in found if not any(set(o.names) < set(t.names) for o in found)]
 
 
 def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ...]]:
