@@ -32,6 +32,7 @@ from identify.results import (
 )
 from identify.structure import Effect, Structure
 from identify.trace import ALPHA, Cancelled, Tried
+from identify.whereabouts import whereabouts
 
 Progress = Callable[[float, str], None]
 
@@ -110,6 +111,13 @@ def diagnose(
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
+    where = None
+    if verdict == "unexplained":
+        where = whereabouts(
+            ready.structure, data, base, tried, run,
+            lambda share, text: report(0.95 + 0.04 * share, text),
+        )  # fmt: skip
+        explanation = f"{explanation} {where.words}"
     after = before if chosen is None else assess.assess(chosen.fit, data)
     before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
@@ -128,6 +136,7 @@ def diagnose(
         next_experiment=_next(ready, verdict, tried, chosen),
         seconds=time.perf_counter() - began,
         explanation=explanation,
+        whereabouts=where,
     )
 
 

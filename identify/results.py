@@ -284,6 +284,47 @@ class Residual:
         }
 
 
+PLACES = {
+    "forward": "forward path",
+    "flame": "flame path",
+    "nonlinearity": "nonlinearity",
+    "actuator": "actuator",
+    "sensor": "sensors",
+    "experiment": "course of the experiment",
+}
+
+
+@dataclass(frozen=True)
+class Whereabouts:
+    """Where an unexplained misfit lies: what a freely shaped piece at each place leaves of it.
+
+    `left` is χ²/dof by place, best first, `before` that of the declared model; `likely` are the
+    places that are not ruled out, none where no place takes up most of the misfit.
+    """
+
+    likely: tuple[str, ...]
+    left: Mapping[str, float]
+    before: float
+
+    @property
+    def words(self) -> str:
+        """One sentence."""
+        listed = ", ".join(f"{place} {left:.3g}" for place, left in self.left.items())
+        sizes = f"χ²/dof {self.before:.3g}; with a freely shaped piece in one place: {listed}"
+        if not self.likely:
+            return f"No place in the loop takes it up by itself ({sizes})."
+        sure = "lies" if len(self.likely) == 1 else "may lie"
+        where = " or the ".join(PLACES[p] for p in self.likely)
+        return f"What is missing {sure} in the {where} ({sizes})."
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "likely": list(self.likely),
+            "chi2_per_dof": {place: number(left) for place, left in self.left.items()},
+            "before": number(self.before),
+        }
+
+
 @dataclass(frozen=True)
 class Diagnosis:
     """What the declared model lacks, or that nothing known explains it."""
@@ -300,6 +341,7 @@ class Diagnosis:
     next_experiment: Mapping[str, Any] | None
     seconds: float
     explanation: str = ""
+    whereabouts: Whereabouts | None = None  # of an unexplained misfit
 
     @property
     def noise_floor(self) -> float:
@@ -321,6 +363,7 @@ class Diagnosis:
             "after": self.after.to_json(),
             "next_experiment": None if self.next_experiment is None else dict(self.next_experiment),
             "explanation": self.explanation,
+            "whereabouts": None if self.whereabouts is None else self.whereabouts.to_json(),
         }
 
 

@@ -18,6 +18,7 @@ only weigh candidates that are adequate already.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -48,10 +49,12 @@ Progress = Callable[[float, str], None]
 
 ALPHA = 1e-3  # false-alarm probability of each significance test
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
+UNSETTLED = 60.0  # the same for a fit that has not converged
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
 SURELY = 4  # so many are refitted in any case
+REFORMED = 3  # sets of effects of which other forms are tried
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
@@ -81,6 +84,10 @@ class Tried:
     @property
     def key(self) -> tuple[str, ...]:
         return tuple(sorted(self.names))
+
+    @property
+    def key_of_forms(self) -> tuple[str, ...]:
+        return tuple(sorted(e.key for e in self.effects))
 
     @property
     def adequate(self) -> bool:
@@ -357,7 +364,7 @@ def _canonical(fit: Fit, data: Dataset) -> Fit:
     return fit
 
 
-def _shares(base: Fit, data: Dataset) -> tuple[float, float, float]:
+def shares_of(base: Fit, data: Dataset) -> tuple[float, float, float]:
     """Noise of the stages as shares of each coefficient's size: of the size of the misfit.
 
     Much coarser, and an effect that explains it does no better than one that does not.
@@ -395,7 +402,7 @@ def try_effects(
         scores = score_tests(structure, data, base, effects, executor)
     known = known_sizes(data, base)
     rough = data.coarse()
-    shares = _shares(base, data)
+    shares = shares_of(base, data)
     tasks = [
         _Task(structure, data, rough, base, e, known, shares, scores.get(e.key)) for e in effects
     ]
@@ -617,7 +624,7 @@ def search(
         grown: list[Tried] = []
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
         for parent in parents:
-            extended.add(tuple(sorted(e.key for e in parent.effects)))
+            extended.add(parent.key_of_forms)
             rest = [e for e in available if e.name not in parent.names]
             grown += try_effects(
                 parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,
@@ -627,9 +634,20 @@ def search(
             break
         if not any(t.adequate for t in grown) and base.chi2_per_dof > GROSS:
             grown = started_again(grown, data, run)
+        if not any(t.explains for t in grown):
+            report(0.6, "trying other forms of the best")
+            grown += _reformed(grown, data, available)
         everything += [eliminate(t, data) for t in grown]
         level = best_by_name(grown)
+        if len(parents[0].effects) == 1 and not any(t.explains for t in everything):
+            report(0.6, "trying run-to-run scatter beside an effect")
+            for parent in parents:
+                if parent.effects[0].location != "experiment":  # which would know of time
+                    everything += try_scatters(parent.fit.structure, data, parent.fit, scatters)
+    if not any(t.explains for t in everything):
+        everything += _reformed([t for t in everything if t.spread is None], data, available)
     everything += _in_their_places(everything, data, available, run, extended, report)
+    everything += _settled(everything, data, run)
     return Search(
         tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
     )
@@ -655,65 +673,112 @@ def _in_their_places(
     best = best_form(good)
     if len(best.effects) == 1:
         return []
-    kept = [tuple(o for o in best.effects if o is not e) for e in best.effects]
-    new = [k for k in kept if tuple(sorted(o.key for o in k)) not in extended]
-    bases = [_with_fewer(best, others, data) for others in new]
     out: list[Tried] = []
-    for base in [*bases, _without(best, (), data)]:
+    for kept in [*combinations(best.effects, len(best.effects) - 1), ()]:
+        if kept and tuple(sorted(e.key for e in kept)) in extended:
+            continue
+        base = _with_fewer(best, kept, data) if kept else part_of(best, (), data)
         if not np.isfinite(base.chi2):
             continue
-        alone = not base.structure.effects
+        names = {e.name for e in kept}
+        tried_already = {e.key for e in best.effects}
         out += try_effects(
             base.structure, data, base,
-            [a for a in available if alone or a.name not in best.names],
-            executor=run, keep=5, far=False, scores={} if alone else None,
+            [a for a in available if a.name not in names and a.key not in tried_already],
+            executor=run, keep=5, far=False, scores=None if kept else {},
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
+    return [eliminate(t, data) for t in out]
+
+
+def _settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
+    """What had not converged and might yet be a rival of the best, led to the end.
+
+    Weak effects leave long flat valleys: a rival must not be ruled out for want of iterations.
+    """
+    good = [t for t in tries if t.explains]
+    if not good:
+        return []
+    least = best_form(good).evidence + UNSETTLED
+    near = [
+        t
+        for t in best_by_name([t for t in tries if t.spread is None])
+        if not t.fit.converged and t.evidence < least
+    ]
+    fits = run.map(_to_the_end, [(t, data) for t in near])
+    pairs = zip(near, fits, strict=True)
+    return [tried(t.effects, fit, data) for t, fit in pairs if fit.chi2 < t.fit.chi2]
+
+
+def _to_the_end(item: tuple[Tried, Dataset]) -> Fit:
+    t, data = item
+    last = t.effects[-1]
+    others = t.fit.theta[: -len(last.parameters)]
+    rows = last.starts(known_sizes(data, t.fit))
+    inner = [[q.to_internal(v) for q, v in zip(last.parameters, r, strict=True)] for r in rows]
+    again = [s.theta for s in coarse(t.fit.structure, data, [np.r_[others, r] for r in inner])]
+    thetas = np.stack([t.fit.theta, *again[:3]])
+    return fit_orbits(t.fit.structure, data, thetas, continuation=(0.003, 0.0), iterations=200)
+
+
+def _reformed(grown: Sequence[Tried], data: Dataset, available: Sequence[Effect]) -> list[Tried]:
+    """Other forms of the best few sets, one after the other for as long as that helps."""
+    out: list[Tried] = []
+    for t in best_by_name(grown)[:REFORMED]:
+        current = t
+        for _ in range(len(t.effects) + 1):
+            found = _other_forms([current], data, available)
+            out += found
+            best = min(found, key=_misfit, default=current)
+            if best.explains or not best.fit.chi2 < current.fit.chi2 - EVIDENCE:
+                break
+            current = best
     return out
 
 
-def _other_forms(
-    singles: Sequence[Tried], data: Dataset, available: Sequence[Effect]
-) -> list[Tried]:
-    """The other forms of the best single effect, started from where it ended.
+def _other_forms(tries: Sequence[Tried], data: Dataset, available: Sequence[Effect]) -> list[Tried]:
+    """The other forms of the effects of the best of `tries`, started from where it ended.
 
     A form with one parameter less may do as well, and is then what should be named; where none
     explains the data, another may be nearer to the truth than the one that was refitted first.
     """
-    good = [t for t in singles if t.explains]
-    best = min(good, key=lambda t: t.evidence) if good else min(singles, key=_misfit, default=None)
+    good = [t for t in tries if t.explains]
+    best = min(good, key=lambda t: t.evidence) if good else min(tries, key=_misfit, default=None)
     if best is None:
         return []
-    base = _without(best, (), data)
     known = known_sizes(data, best.fit)
-    done = {t.effects[-1].key for t in singles if t.adequate} | {best.effects[-1].key}
+    done = {t.key_of_forms for t in tries if t.adequate}
     out = []
-    for e in available:
-        if e.name != best.effects[-1].name or e.key in done:
-            continue
-        larger = base.structure.with_effects(e)
-        rows = e.starts(known)
-        if [q.name for q in e.parameters] == [q.name for q in best.effects[-1].parameters]:
-            rows = [*rows, tuple(best.fit.values[q.name] for q in e.parameters)]
-        thetas = [
-            np.r_[
-                _beside(base.structure, base.theta, data, e, row),
-                [q.to_internal(v) for q, v in zip(e.parameters, row, strict=True)],
+    for e in best.effects:
+        kept = tuple(o for o in best.effects if o is not e)
+        base = part_of(best, kept, data)
+        for form in available:
+            forms = tuple(sorted(o.key for o in (*kept, form)))
+            if form.name != e.name or form.key == e.key or forms in done:
+                continue
+            larger = base.structure.with_effects(form)
+            rows = form.starts(known)
+            if [q.unit for q in form.parameters] == [q.unit for q in e.parameters]:
+                rows = [*rows, tuple(best.fit.values[q.name] for q in e.parameters)]
+            thetas = [
+                np.r_[
+                    _beside(base.structure, base.theta, data, form, row),
+                    [q.to_internal(v) for q, v in zip(form.parameters, row, strict=True)],
+                ]
+                for row in rows
             ]
-            for row in rows
-        ]
-        found = coarse(larger, data, thetas)[:2]
-        if not found:
-            continue
-        starts = np.stack([s.theta for s in found])
-        fit = fit_orbits(larger, data, starts, continuation=(0.003, 0.0), iterations=30)
-        if np.isfinite(fit.chi2):
-            out.append(tried((e,), fit, data))
+            found = coarse(larger, data, thetas)[:2]
+            if not found:
+                continue
+            starts = np.stack([s.theta for s in found])
+            fit = fit_orbits(larger, data, starts, continuation=(0.003, 0.0), iterations=30)
+            if np.isfinite(fit.chi2):
+                out.append(tried(larger.effects, fit, data))
     return out
 
 
-def _without(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
-    """The values of `t` with only some of its effects, not fitted again: as loud as with all."""
+def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
+    """The values of `t` with some of its effects, not fitted again: as loud as with all."""
     structure, values = replace(t.fit.structure, effects=effects), t.fit.values
     theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
     left = [e for e in t.effects if e not in effects]

@@ -16,10 +16,12 @@ from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.record import Campaign
+from identify.report.gallery import save_figures
 from identify.scatter import fit_scatter
+from identify.whereabouts import whereabouts
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
-from simulated_rig.effects import make_effect
+from simulated_rig.effects import EFFECTS, make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
@@ -230,3 +232,119 @@ def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
     best = trace.best_form([t for t in found.tried if t.adequate and t.plausible])
     names = {best.key, *(t.key for t in trace.rivals(best, trace.best_by_name(found.tried)))}
     assert names == {("flame_delay", "parameter_drift"), ("flame_dynamics", "parameter_drift")}
+
+
+def thesis_campaign(
+    folder: Path,
+    seed: int,
+    effects: dict[str, dict[str, float]],
+    noise_db: float = 36.0,
+    forced: int = 7,
+) -> Prepared:
+    """The thesis's rig with these effects, recorded and prepared."""
+    made = [make_effect(key, parameters) for key, parameters in effects.items()]
+    rig, plan = random_campaign(
+        seed, build_config(noise_db=noise_db), made, forced=forced, validation=2
+    )
+    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
+    return prepare(load_campaign(open_campaign(folder)))
+
+
+def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tried]]:
+    """The best explanation by these effects, and its rivals."""
+    base = start.fit_from_data(ready.structure, ready.data)
+    found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
+    best = trace.best_form([t for t in found.tried if t.explains])
+    return best, trace.rivals(best, trace.best_by_name(found.tried))
+
+
+def test_the_other_forms_of_the_nearest_effect_are_tried(tmp_path: Path) -> None:
+    """A speaker that resonates at 160 Hz: by its acceleration, refitted first, it is not explained,
+    and was with a further mode beside it."""
+    rig, plan = random_campaign(
+        11,
+        random_rig(11, noise_db=70.0, modes=(2,)),
+        [make_effect("actuator_dynamics/resonance", {"resonance_hz": 160.0, "damping": 0.47})],
+        forced=8,
+        validation=2,
+    )
+    write_campaign(simulate_campaign(rig, plan, 11, declared_modes=2), tmp_path)
+    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    keys = ("actuator_dynamics:acceleration", "actuator_dynamics:resonance", "acoustic_mode")
+    best, rivals = search_for(ready, *keys)
+    assert [e.key for e in best.effects] == ["actuator_dynamics:resonance"]
+    assert rivals == []
+
+
+def test_a_rival_is_not_ruled_out_for_want_of_iterations(tmp_path: Path) -> None:
+    """A second time scale of the flame beside a drift, both small: what it leaves falls slowly."""
+    effects = {
+        "flame_dynamics/second_time_scale": {"slow_share": 0.14, "slow_pole_hz": 29.0},
+        "parameter_drift/speaker_gain": {"speaker_gain_change": -0.00125},
+    }
+    ready = thesis_campaign(tmp_path, 31, effects, noise_db=45.0)
+    keys = (
+        "parameter_drift:speaker_gain",
+        "channel_mismatch:gain_skew",
+        "flame_dynamics:second_time_scale",
+    )
+    best, rivals = search_for(ready, *keys)
+    truth = ("flame_dynamics", "parameter_drift")
+    assert truth in [best.key, *(t.key for t in rivals)]
+
+
+def test_which_mode_is_the_further_one_is_named_by_rule_beside_another_effect(
+    tmp_path: Path,
+) -> None:
+    """The one that takes the smallest part near the singing mode, in a pair as alone."""
+    effects = {
+        "acoustic_mode": {
+            "frequency_hz": 345.0,
+            "damping": 0.017,
+            "flame_residue_ratio": -0.29,
+            "speaker_residue_ratio": -0.29,
+        },
+        "flame_delay": {"delay_s": 2.3e-4},
+    }
+    ready = thesis_campaign(tmp_path, 21, effects)
+    best, _ = search_for(ready, "acoustic_mode", "flame_delay")
+    assert best.key == ("acoustic_mode", "flame_delay")
+    assert best.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(345.0, abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("key", "parameters", "place"),
+    [
+        ("nonlinear_damping/cubic", {}, "forward"),
+        ("flame_delay", {"delay_s": 3e-4}, "flame"),
+        ("nonlinearity_shape/quartic", {}, "nonlinearity"),
+        ("actuator_dynamics/voice_coil", {}, "actuator"),
+        ("channel_mismatch/gain", {}, "sensor"),
+        ("parameter_drift/damping", {}, "experiment"),
+    ],
+)
+def test_what_no_candidate_explains_is_placed(
+    tmp_path: Path, key: str, parameters: dict[str, float], place: str
+) -> None:
+    """A freely shaped piece takes the misfit up where it lies, and nowhere else."""
+    drawn = EFFECTS[key].draw(np.random.default_rng(5), 0.5)
+    values = parameters or {n: float(v["value"]) for n, v in drawn.parameters().items()}
+    ready = thesis_campaign(tmp_path, 7, {key: values})
+    base = start.fit_from_data(ready.structure, ready.data)
+    found = whereabouts(
+        ready.structure, ready.data, base, [], InProcess(), lambda share, text: None
+    )
+    assert found.likely == (place,), found.words
+    assert place in found.words or "sensors" in found.words
+
+
+def test_unexplained_says_where(tmp_path: Path) -> None:
+    """Without the candidate that it is, a flame delay ends as unexplained, on the flame's side."""
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
+    found = identify.diagnose(ready.campaign, catalogue=[by_key("channel_mismatch:gain")])
+    assert found.verdict == "unexplained"
+    assert found.whereabouts is not None
+    assert found.whereabouts.likely == ("flame",)
+    assert found.to_json()["whereabouts"]["likely"] == ["flame"]
+    assert "lies in the flame path" in found.explanation
+    assert "places" in [path.stem for path in save_figures(tmp_path / "figures", found)]

@@ -23,7 +23,7 @@ class HigherOrder(Effect):
 
     def __init__(self, powers: tuple[int, ...]) -> None:
         self.powers = powers
-        words = {4: "quartic", 5: "quintic", 7: "septic"}
+        words = {4: "quartic", 5: "quintic", 6: "sextic", 7: "septic"}
         self.form = "_".join(words[d] for d in powers)
         self.parameters = tuple(
             Parameter(f"nonlinearity_shape.c{d}", f"m^-{d - 1}") for d in powers

@@ -14,12 +14,12 @@ from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
 
-def _upper_pressure(at: Conditions, s: Any) -> Any:
+def upper_pressure(at: Conditions, s: Any) -> Any:
     """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
     return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
 
 
-def _add(at: Conditions, y: Any, leak: Any) -> Any:
+def with_leak(at: Conditions, y: Any, leak: Any) -> Any:
     """Prediction plus a leak formed from measured signals, in the measurement's phase.
 
     A free run's orbit has a phase of its own: it is turned first, so that its fundamental stands
@@ -77,8 +77,8 @@ class ChannelMismatch(Effect):
                 inverse = inverse * dual.exp(1j * value)
             else:
                 inverse = inverse * (s * value + 1.0)
-        leak = _upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
-        return _add(at, y, leak * (inverse - 1.0))
+        leak = upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+        return with_leak(at, y, leak * (inverse - 1.0))
 
 
 class SensorOffset(Effect):
@@ -123,7 +123,7 @@ class SensorOffset(Effect):
         impedance = at.density_kg_m3 * at.sound_speed_m_s
         leak = dual.sin(angle) * (1j / impedance * at.pressure)
         cosine = dual.cos(angle)
-        return _add(at, y / cosine, -(leak / cosine))
+        return with_leak(at, y / cosine, -(leak / cosine))
 
 
 class ModalOffset(Effect):

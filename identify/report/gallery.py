@@ -11,7 +11,7 @@ from identify.report import theme
 from identify.report.compared import harmonics_figure
 from identify.report.controller import Steps, controller_steps
 from identify.report.misfit import heat_map, residual_trends
-from identify.report.ranking import ranking
+from identify.report.ranking import places, ranking
 from identify.report.response_figures import (
     frequency_responses,
     models,
@@ -86,6 +86,14 @@ def figures(
             ranking(result),
             "Candidates, best first, each refitted. Dashed: what noise alone gives. Blue: claimed; "
             "green: adequate and plausible; grey: neither.",
+        )
+    if isinstance(result, Diagnosis) and result.whereabouts and result.whereabouts.left:
+        yield Drawn(
+            "places",
+            "candidates",
+            places(result.whereabouts),
+            "Where it lies: what is left with one freely shaped piece in each place of the loop. "
+            "Blue: where it may lie; grey: ruled out, or too little taken up.",
         )
 
 

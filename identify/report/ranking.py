@@ -1,11 +1,17 @@
-"""Candidates ranked: misfit and validation error, each with the line that noise draws."""
+"""Candidates and places ranked: misfit and validation error, with the line that noise draws."""
+
+from collections.abc import Sequence
 
 import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from identify.report import theme
 from identify.report.words import label, scientific
-from identify.results import Candidate, Diagnosis
+from identify.results import PLACES, Candidate, Diagnosis, Whereabouts
+
+FloatArray = npt.NDArray[np.float64]
 
 MOST = 14  # candidates shown; the table has them all
 
@@ -25,37 +31,59 @@ def ranking(d: Diagnosis) -> Figure:
         0.75 + 0.24 * len(names), 1, 2, margins, widths=(1.4, 1), sharey=True
     )
     left, right = axes[0]
-    finite = chi2[np.isfinite(chi2) & (chi2 > 0)]
-    start = min(0.3, float(finite.min()) / 2) if finite.size else 0.3
-    length = np.where(np.isfinite(chi2), np.maximum(chi2, start) - start, 0.0)
-    left.barh(y, length, left=start, color=colours, height=0.62)
-    for at, value in zip(y, chi2, strict=True):
-        if np.isfinite(value):
-            left.annotate(scientific(float(value)), (max(value, start), at), xytext=(3, 0),
-                          textcoords="offset points", va="center", fontsize=7,
-                          bbox={"fc": theme.PAPER, "ec": "none", "pad": 0.6})  # fmt: skip
-        else:
-            left.annotate("not converged", (start, at), xytext=(3, 0),
-                          textcoords="offset points", va="center", fontsize=7)  # fmt: skip
-    left.axvline(1.0, color=theme.NOISE, lw=1.0, ls="--")
+    _bars(left, names, chi2, colours)
     if np.isfinite(d.noise_floor):
         right.axvline(d.noise_floor * 100, color=theme.NOISE, lw=1.0, ls="--")
     for at, value, colour in zip(y, errors, colours, strict=True):
         if np.isfinite(value):
             right.plot(value * 100, at, "o", color=colour)
-    for ax, x in ((left, 1.0), (right, d.noise_floor * 100)):
-        ax.set_xscale("log")
-        ax.grid(axis="y", visible=False)
-        ax.annotate("noise", (x, 1.0), xycoords=("data", "axes fraction"), xytext=(2, 1),
-                    textcoords="offset points", fontsize=7, color=theme.MUTED)  # fmt: skip
-    theme.decades(left.xaxis)
+    _noise(right, d.noise_floor * 100)
     theme.narrow_decades(right.xaxis)
-    left.set_xlim(start, (float(finite.max()) if finite.size else 1.0) * 6)
-    left.set_yticks(y, names)
-    left.invert_yaxis()
-    left.set_xlabel("χ² per degree of freedom")
     right.set_xlabel("validation error (%)")
     return figure
+
+
+@theme.styled
+def places(found: Whereabouts) -> Figure:
+    """χ² per degree of freedom that a freely shaped piece leaves at each place of the loop."""
+    names = ["declared model", *(PLACES[p] for p in found.left)]
+    chi2 = np.array([found.before, *found.left.values()])
+    likely = [theme.AFTER if p in found.likely else theme.NOISE for p in found.left]
+    margins = theme.Margins(left=0.3 + 0.062 * max(len(n) for n in names))
+    figure, axes = theme.panels(0.75 + 0.24 * len(names), 1, 1, margins)
+    _bars(axes[0, 0], names, chi2, [theme.BEFORE, *likely])
+    return figure
+
+
+def _bars(ax: Axes, names: Sequence[str], chi2: FloatArray, colours: Sequence[str]) -> None:
+    """Bars of χ² per degree of freedom, first on top, each with its value."""
+    y = np.arange(len(names))
+    finite = chi2[np.isfinite(chi2) & (chi2 > 0)]
+    start = min(0.3, float(finite.min()) / 2) if finite.size else 0.3
+    length = np.where(np.isfinite(chi2), np.maximum(chi2, start) - start, 0.0)
+    ax.barh(y, length, left=start, color=colours, height=0.62)
+    for at, value in zip(y, chi2, strict=True):
+        if np.isfinite(value):
+            ax.annotate(scientific(float(value)), (max(value, start), at), xytext=(3, 0),
+                        textcoords="offset points", va="center", fontsize=7,
+                        bbox={"fc": theme.PAPER, "ec": "none", "pad": 0.6})  # fmt: skip
+        else:
+            ax.annotate("not converged", (start, at), xytext=(3, 0),
+                        textcoords="offset points", va="center", fontsize=7)  # fmt: skip
+    ax.axvline(1.0, color=theme.NOISE, lw=1.0, ls="--")
+    _noise(ax, 1.0)
+    theme.decades(ax.xaxis)
+    ax.set_xlim(start, (float(finite.max()) if finite.size else 1.0) * 6)
+    ax.set_yticks(y, names)
+    ax.invert_yaxis()
+    ax.set_xlabel("χ² per degree of freedom")
+
+
+def _noise(ax: Axes, x: float) -> None:
+    ax.set_xscale("log")
+    ax.grid(axis="y", visible=False)
+    ax.annotate("noise", (x, 1.0), xycoords=("data", "axes fraction"), xytext=(2, 1),
+                textcoords="offset points", fontsize=7, color=theme.MUTED)  # fmt: skip
 
 
 def _colour(c: Candidate, d: Diagnosis) -> str:

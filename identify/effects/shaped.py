@@ -1,0 +1,166 @@
+"""Freely shaped pieces, one for each place of the loop: they stand for no law, only for the place.
+
+A linear response is 1 + Σ_j h_j (B^j − 1), B = (ω₀ − s)/(ω₀ + s), j = 1 … 4: powers of an all-pass
+step at the free frequency follow any smooth response and grow nowhere (Laguerre's functions).
+Every piece vanishes where its parameters do. None is a candidate of a diagnosis: they say where
+something lies that no candidate explains (`identify.whereabouts`).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from identify.effects.actuator import Distortion
+from identify.effects.forward import AcousticMode
+from identify.effects.nonlinearity import HigherOrder
+from identify.effects.sensor import upper_pressure, with_leak
+from identify.parameters import Parameter
+from identify.polynomial import Polynomial
+from identify.structure import Conditions, Effect, Known, Loss, Mode, Values
+
+STEPS = 4
+MODE = AcousticMode()
+DISTORTION = Distortion((2, 3))
+POWERS = HigherOrder((4, 5, 6, 7))
+WANDERING = ("frequency", "damping", "flame", "speaker")
+
+
+class Shaped(Effect):
+    """Root of the pieces: a linear response, and what a place needs besides."""
+
+    linear = True
+    besides: tuple[Parameter, ...] = ()
+
+    def __init__(self, free_hz: float) -> None:
+        self.corner = 2 * np.pi * free_hz
+        self.name = f"shaped_{self.location}"
+        steps = range(1, STEPS + 1) if self.linear else ()
+        own = tuple(Parameter(f"{self.name}.h{j}", "1", scale=1e-2) for j in steps)
+        self.parameters = (*own, *self.besides)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0,) * len(self.parameters)]
+
+    def neutral(self) -> tuple[float, ...] | None:
+        return (0.0,) * len(self.parameters)
+
+    def response(self, p: Values, s: Any) -> Any:
+        step = (self.corner - s) / (s + self.corner)
+        power, total = step, 1.0
+        for j in range(1, STEPS + 1):
+            total = total + (power - 1.0) * p[f"{self.name}.h{j}"]
+            power = power * step
+        return total
+
+
+class ShapedFlame(Shaped):
+    """Any smooth linear response of the flame."""
+
+    location = "flame"
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return self.response(p, s)
+
+
+class ShapedActuator(Shaped):
+    """Any smooth linear response of the speaker, and its distortion."""
+
+    location, besides = "actuator", DISTORTION.parameters
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        return self.response(p, s)
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        return DISTORTION.drive(p, at, u)
+
+
+class ShapedSensor(Shaped):
+    """Any smooth linear response of the velocity's measurement, and a share of the pressure."""
+
+    location = "sensor"
+    besides = tuple(Parameter(f"shaped_sensor.pressure{j}", "1", scale=1e-3) for j in (0, 1, 2))
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        step = (self.corner - s) / (s + self.corner)
+        leak = upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+        shares: Sequence[Any] = [p[q.name] for q in self.besides]
+        passed = shares[0] + step * shares[1] + step * step * shares[2]
+        return with_leak(at, y * self.response(p, s), leak * passed)
+
+
+class ShapedForward(Shaped):
+    """Any smooth linear response common to flame and speaker, one more mode, and a cubic loss.
+
+    A factor on the acoustics changes the velocity that is measured and that the flame feels.
+    """
+
+    location = "forward"
+    besides = (*MODE.parameters, Parameter("shaped_forward.loss", "s/m²"))
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(*(0.0,) * STEPS, *row, 0.0) for row in MODE.starts(known)]
+
+    def neutral(self) -> None:
+        return None
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return self.response(p, s)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        return y * self.response(p, s)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        return MODE.modes(p, at, modes)
+
+    def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss:
+        beta = p["shaped_forward.loss"]
+        return Loss([beta] * len(modes), Polynomial((0.0, 0.0, 1.0)), [1.0] * len(modes))
+
+
+class ShapedNonlinearity(Shaped):
+    """Powers four to seven of the flame's input."""
+
+    location, linear, besides = "nonlinearity", False, POWERS.parameters
+    characteristic = POWERS.characteristic
+
+
+class ShapedExperiment(Shaped):
+    """Frequencies, damping, flame and speaker gain that change with time, quadratically."""
+
+    location, linear = "experiment", False
+    besides = tuple(
+        Parameter(f"shaped_experiment.{what}_{word}", "1", scale=1e-3)
+        for what in WANDERING
+        for word in ("change", "curvature")
+    )
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        t = at.time[:, None]
+        f, z, r, a = (
+            p[f"shaped_experiment.{what}_change"] * t
+            + p[f"shaped_experiment.{what}_curvature"] * (t * t - t)
+            + 1.0
+            for what in WANDERING
+        )
+        return [
+            replace(
+                m,
+                frequency_hz=m.frequency_hz * f,
+                damping=m.damping * z,
+                flame_residue=m.flame_residue * r,
+                speaker_residue=m.speaker_residue * a,
+            )
+            for m in modes
+        ]
+
+
+PIECES: tuple[type[Shaped], ...] = (
+    ShapedForward,
+    ShapedFlame,
+    ShapedNonlinearity,
+    ShapedActuator,
+    ShapedSensor,
+    ShapedExperiment,
+)

@@ -1,0 +1,86 @@
+"""Where in the loop lies what no known effect explains.
+
+A freely shaped piece (`identify.effects.shaped`) is put at each place of the loop in turn and
+fitted like an effect, from the declared fit and from what the best effects make of the declared
+model. The place whose piece takes up most of the misfit, clearly more than any other, is where it
+lies; a place whose piece takes up little is where it is not.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from identify.dataset import Dataset
+from identify.effects.shaped import PIECES
+from identify.executor import Executor
+from identify.fit import Fit, fit_orbits
+from identify.results import Whereabouts
+from identify.start import coarse
+from identify.structure import Structure
+from identify.trace import EVIDENCE, Tried, known_sizes, part_of, shares_of, usable
+from identify.trace import tried as as_tried
+
+CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
+TAKEN = 0.3  # share of the excess over noise that the best place may leave
+STARTS = 3
+
+
+def _place(t: Tried) -> str:
+    return t.effects[0].location
+
+
+def _likely(places: Sequence[Tried], before: float) -> tuple[str, ...]:
+    """Those not ruled out: by a third of the χ², or, where the best explains the data, by the
+    evidence; none where even the best leaves much of the misfit."""
+    if not places:
+        return ()
+    best = places[0]
+    if not best.fit.chi2_per_dof - 1.0 < TAKEN * (before - 1.0):
+        return ()
+    limit = CLEARLY * max(best.fit.chi2_per_dof, 1.0)
+    return tuple(
+        _place(t)
+        for t in places
+        if t.fit.chi2_per_dof <= limit
+        and not (best.adequate and t.evidence > best.evidence + EVIDENCE)
+    )
+
+
+def whereabouts(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    tried: Sequence[Tried],
+    executor: Executor,
+    progress: Callable[[float, str], None],
+) -> Whereabouts:
+    """A piece at each place, started from the declared fit and from what the best of `tried` make
+    of the declared model."""
+    pieces = [p for p in (piece(data.free_hz) for piece in PIECES) if usable(p, data, structure)]
+    best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]
+    bases = [base, *(part_of(t, (), data) for t in best)]
+    items = [(structure.with_effects(p), data, bases) for p in pieces]
+    found: list[Tried] = []
+    for piece, fit in zip(pieces, executor.map(_shape, items), strict=True):
+        progress((len(found) + 1) / len(pieces), f"shaping the {piece.location} freely")
+        if np.isfinite(fit.chi2):
+            found.append(as_tried((piece,), fit, data))
+    places = sorted(found, key=lambda t: t.fit.chi2)
+    left = {_place(t): t.fit.chi2_per_dof for t in places}
+    return Whereabouts(_likely(places, base.chi2_per_dof), left, base.chi2_per_dof)
+
+
+def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit:
+    """The best fit of a structure with one piece, from several fits without it."""
+    structure, data, bases = item
+    piece = structure.effects[0]
+    fits = []
+    for base in bases:
+        rows = piece.starts(known_sizes(data, base))
+        inner = [[q.to_internal(v) for q, v in zip(piece.parameters, r, strict=True)] for r in rows]
+        first, *others = shares_of(base, data)
+        starts = coarse(structure, data, [np.r_[base.theta, row] for row in inner], first)[:STARTS]
+        if starts:
+            thetas = np.stack([s.theta for s in starts])
+            fits.append(fit_orbits(structure, data, thetas, continuation=(first, *others, 0.0)))
+    return min(fits, key=lambda f: f.chi2)
