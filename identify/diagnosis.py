@@ -32,7 +32,6 @@ from identify.results import (
 )
 from identify.structure import Effect, Structure
 from identify.trace import ALPHA, Cancelled, Tried
-from identify.whereabouts import whereabouts
 
 Progress = Callable[[float, str], None]
 
@@ -113,7 +112,7 @@ def diagnose(
         explanation += " A foreign tone stands in the channels of most runs."
     where = None
     if verdict == "unexplained":
-        where = whereabouts(
+        where = trace.whereabouts(
             ready.structure, data, base, tried, run,
             lambda share, text: report(0.95 + 0.04 * share, text),
         )  # fmt: skip

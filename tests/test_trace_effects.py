@@ -18,7 +18,8 @@ from identify.load import load_campaign
 from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.scatter import fit_scatter
-from identify.whereabouts import whereabouts
+from identify.trace.places import whereabouts
+from identify.trace.stages import known_sizes
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import EFFECTS, make_effect
@@ -187,7 +188,7 @@ def test_derivatives_through_corners(tmp_path: Path, form: str) -> None:
     ready, base = recorded(tmp_path, 3, "")
     effect = by_key(f"nonlinearity_shape:{form}")
     width = effect.parameters[0]
-    known = trace.known_sizes(ready.data, base)
+    known = known_sizes(ready.data, base)
     structure = ready.structure.with_effects(effect)
     theta = np.r_[base.theta, width.to_internal(0.05 * known.flame_input_amplitude)]
     at = ready.data.fit[0].at

@@ -3,7 +3,7 @@
 A linear response is 1 + Σ_j h_j (B^j − 1), B = (ω₀ − s)/(ω₀ + s), j = 1 … 4: powers of an all-pass
 step at the free frequency follow any smooth response and grow nowhere (Laguerre's functions).
 Every piece vanishes where its parameters do. None is a candidate of a diagnosis: they say where
-something lies that no candidate explains (`identify.whereabouts`).
+something lies that no candidate explains (`identify.trace.places`).
 """
 
 from collections.abc import Sequence

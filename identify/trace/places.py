@@ -17,8 +17,11 @@ from identify.fit import Fit, fit_orbits
 from identify.results import Whereabouts
 from identify.start import coarse
 from identify.structure import Structure
-from identify.trace import EVIDENCE, Tried, known_sizes, part_of, shares_of, usable
-from identify.trace import tried as as_tried
+from identify.trace.contests import part_of
+from identify.trace.selection import usable
+from identify.trace.stages import known_sizes, shares_of
+from identify.trace.tried import EVIDENCE, Tried
+from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave

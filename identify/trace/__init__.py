@@ -1,0 +1,53 @@
+"""From residual to cause: which effect the declared model lacks, where, how large, how sure.
+
+1. Is there anything to explain? Whitened lack of fit on the fitted and on the validation runs, and
+   score tests (`scores`).
+2. Every form of every candidate effect is added to the declared model and refitted in stages
+   (`stages`).
+3. If no single effect explains the data to within noise, run-to-run scatter is tried, and pairs
+   are grown from the best singles, then triples; scatter beside an effect (`selection`). An effect
+   stays only if leaving it out makes the fit significantly worse; other forms are tried, others in
+   the place of each and of all, and what had not converged is led to the end (`contests`).
+4. What explains the data must also predict the validation runs, lie in its plausible range, and
+   have no rival: another effect that does as well, complexity counted (`tried`).
+5. Where nothing explains the data, freely shaped pieces say where in the loop it lies
+   (`places`).
+"""
+
+from identify.trace.places import whereabouts
+from identify.trace.scores import ScoreTest, family_p, score_tests
+from identify.trace.selection import GROSS, Cancelled, refitted, search, usable, without_effects
+from identify.trace.stages import started_again, try_effects
+from identify.trace.tried import (
+    ALPHA,
+    EVIDENCE,
+    Tried,
+    best_by_name,
+    best_form,
+    candidate,
+    other_forms,
+    rivals,
+)
+
+__all__ = [
+    "ALPHA",
+    "EVIDENCE",
+    "GROSS",
+    "Cancelled",
+    "ScoreTest",
+    "Tried",
+    "best_by_name",
+    "best_form",
+    "candidate",
+    "family_p",
+    "other_forms",
+    "refitted",
+    "rivals",
+    "score_tests",
+    "search",
+    "started_again",
+    "try_effects",
+    "usable",
+    "whereabouts",
+    "without_effects",
+]

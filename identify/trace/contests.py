@@ -1,0 +1,187 @@
+"""What has been found, contested: fewer effects, other forms, others in their places, to the end.
+
+A search grows sets one effect at a time and drops what falls behind. Before one of them is
+claimed, what might do as well from where it ended is tried.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from identify.chances import chi2_tail
+from identify.dataset import Dataset
+from identify.effects import CATALOGUE
+from identify.executor import Executor
+from identify.fit import Fit, fit_orbits
+from identify.start import coarse
+from identify.structure import Effect
+from identify.trace.stages import beside, known_sizes, louder, loudness, try_effects
+from identify.trace.tried import ALPHA, EVIDENCE, Tried, best_by_name, best_form, misfit, tried
+
+Progress = Callable[[float, str], None]
+
+UNSETTLED = 60.0  # the same for a fit that has not converged
+REFORMED = 3  # sets of effects of which other forms are tried
+
+
+def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
+    """The values of `t` with some of its effects, not fitted again: as loud as with all."""
+    structure, values = replace(t.fit.structure, effects=effects), t.fit.values
+    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+    left = [e for e in t.effects if e not in effects]
+    theta = louder(theta, structure.parameters.names, loudness(data, left, values))
+    return replace(t.fit, structure=structure, theta=theta)
+
+
+def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
+    """The fit with only some of the effects of `t`, started from its values."""
+    smaller, values = replace(t.fit.structure, effects=effects), t.fit.values
+    theta = smaller.parameters.to_internal([values[n] for n in smaller.parameters.names])
+    return fit_orbits(smaller, data, theta, continuation=(0.003, 0.0))
+
+
+def eliminate(candidate: Tried, data: Dataset) -> Tried:
+    """Backward elimination: effects without which the fit is no worse than chance are dropped."""
+    current = candidate
+    while len(current.effects) > 1:
+        smaller = []
+        for leave in current.effects:
+            rest = tuple(e for e in current.effects if e is not leave)
+            fit = with_fewer(current, rest, data)
+            gain = fit.chi2 - current.fit.chi2
+            freedom = current.fit.theta.size - fit.theta.size
+            if np.isfinite(gain) and chi2_tail(gain, freedom) > ALPHA / len(CATALOGUE):
+                smaller.append((gain, rest, fit))
+        if not smaller:
+            break
+        _, rest, fit = min(smaller, key=lambda item: item[0])
+        current = tried(rest, fit, data)
+    return current
+
+
+def in_other_forms(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect]
+) -> list[Tried]:
+    """The other forms of the effects of the best of `tries`, started from where it ended.
+
+    A form with one parameter less may do as well, and is then what should be named; where none
+    explains the data, another may be nearer to the truth than the one that was refitted first.
+    """
+    good = [t for t in tries if t.explains]
+    best = min(good, key=lambda t: t.evidence) if good else min(tries, key=misfit, default=None)
+    if best is None:
+        return []
+    known = known_sizes(data, best.fit)
+    done = {t.key_of_forms for t in tries if t.adequate}
+    out = []
+    for e in best.effects:
+        kept = tuple(o for o in best.effects if o is not e)
+        base = part_of(best, kept, data)
+        for form in available:
+            forms = tuple(sorted(o.key for o in (*kept, form)))
+            if form.name != e.name or form.key == e.key or forms in done:
+                continue
+            larger = base.structure.with_effects(form)
+            rows = form.starts(known)
+            if [q.unit for q in form.parameters] == [q.unit for q in e.parameters]:
+                rows = [*rows, tuple(best.fit.values[q.name] for q in e.parameters)]
+            thetas = [
+                np.r_[
+                    beside(base.structure, base.theta, data, form, row),
+                    [q.to_internal(v) for q, v in zip(form.parameters, row, strict=True)],
+                ]
+                for row in rows
+            ]
+            found = coarse(larger, data, thetas)[:2]
+            if not found:
+                continue
+            starts = np.stack([s.theta for s in found])
+            fit = fit_orbits(larger, data, starts, continuation=(0.003, 0.0), iterations=30)
+            if np.isfinite(fit.chi2):
+                out.append(tried(larger.effects, fit, data))
+    return out
+
+
+def reformed(grown: Sequence[Tried], data: Dataset, available: Sequence[Effect]) -> list[Tried]:
+    """Other forms of the best few sets, one after the other for as long as that helps."""
+    out: list[Tried] = []
+    for t in best_by_name(grown)[:REFORMED]:
+        current = t
+        for _ in range(len(t.effects) + 1):
+            found = in_other_forms([current], data, available)
+            out += found
+            best = min(found, key=misfit, default=current)
+            if best.explains or not best.fit.chi2 < current.fit.chi2 - EVIDENCE:
+                break
+            current = best
+    return out
+
+
+def in_their_places(
+    tries: Sequence[Tried],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    extended: set[tuple[str, ...]],
+    report: Progress,
+) -> list[Tried]:
+    """Other effects in the place of each of several that explain the data together.
+
+    The set was grown from one of them, so that only the places of the others have been contested.
+    One effect in the place of them all is sought too, from what they say of the declared model.
+    `extended` are the sets (of keys, sorted) that have been grown from already.
+    """
+    good = [t for t in tries if t.explains and t.spread is None]
+    if not good:
+        return []
+    best = best_form(good)
+    if len(best.effects) == 1:
+        return []
+    out: list[Tried] = []
+    for kept in [*combinations(best.effects, len(best.effects) - 1), ()]:
+        if kept and tuple(sorted(e.key for e in kept)) in extended:
+            continue
+        base = with_fewer(best, kept, data) if kept else part_of(best, (), data)
+        if not np.isfinite(base.chi2):
+            continue
+        names = {e.name for e in kept}
+        tried_already = {e.key for e in best.effects}
+        out += try_effects(
+            base.structure, data, base,
+            [a for a in available if a.name not in names and a.key not in tried_already],
+            executor=run, keep=5, far=False, scores=None if kept else {},
+            progress=lambda share, text: report(0.95 + 0.05 * share, text),
+        )  # fmt: skip
+    return [eliminate(t, data) for t in out]
+
+
+def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
+    """What had not converged and might yet be a rival of the best, led to the end.
+
+    Weak effects leave long flat valleys: a rival must not be ruled out for want of iterations.
+    """
+    good = [t for t in tries if t.explains]
+    if not good:
+        return []
+    least = best_form(good).evidence + UNSETTLED
+    near = [
+        t
+        for t in best_by_name([t for t in tries if t.spread is None])
+        if not t.fit.converged and t.evidence < least
+    ]
+    fits = run.map(_to_the_end, [(t, data) for t in near])
+    pairs = zip(near, fits, strict=True)
+    return [tried(t.effects, fit, data) for t, fit in pairs if fit.chi2 < t.fit.chi2]
+
+
+def _to_the_end(item: tuple[Tried, Dataset]) -> Fit:
+    t, data = item
+    last = t.effects[-1]
+    others = t.fit.theta[: -len(last.parameters)]
+    rows = last.starts(known_sizes(data, t.fit))
+    inner = [[q.to_internal(v) for q, v in zip(last.parameters, r, strict=True)] for r in rows]
+    again = [s.theta for s in coarse(t.fit.structure, data, [np.r_[others, r] for r in inner])]
+    thetas = np.stack([t.fit.theta, *again[:3]])
+    return fit_orbits(t.fit.structure, data, thetas, continuation=(0.003, 0.0), iterations=200)

@@ -1,0 +1,105 @@
+"""Score tests: along which effects' tangents the declared fit's residual lies.
+
+A tangent is projected off those of the fitted parameters, so that what the fit can absorb is not
+counted as evidence.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from identify.chances import chi2_tail, chi2_tails
+from identify.dataset import Dataset
+from identify.executor import Executor
+from identify.fit import Fit, OrbitResidual
+from identify.structure import Effect, Structure
+
+FloatArray = npt.NDArray[np.float64]
+
+DRAWS = 20_000  # of the bootstrap of the smallest p-value
+DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
+
+
+@dataclass(frozen=True)
+class ScoreTest:
+    """An effect's tangent at its neutral point, projected off the fitted parameters' tangents.
+
+    `drop` is the decrease of χ² that a small effect along it would bring, `size` its estimated
+    internal values, `share` the part of the tangent that the fit cannot absorb, `p_value` of the
+    drop for as many degrees of freedom as the tangent keeps, `basis` (n, degrees of freedom) an
+    orthonormal one of what it keeps: drop = |basisᵀ ρ|².
+    """
+
+    drop: float
+    size: FloatArray
+    share: float
+    p_value: float
+    basis: FloatArray
+
+
+def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) -> ScoreTest | None:
+    """Score test of one more effect at a fitted model; None where it has no neutral point."""
+    neutral = effect.neutral()
+    if neutral is None:
+        return None
+    larger = structure.with_effects(effect)
+    inner = [q.to_internal(v) for q, v in zip(effect.parameters, neutral, strict=True)]
+    outcome = OrbitResidual(larger, data.fit)(np.r_[fit.theta, inner][None], np.array([0]), True)
+    if outcome.jacobian is None or not outcome.exists[0]:
+        return None
+    rho, J = outcome.residual[0], outcome.jacobian[0]
+    base, tangent = J[:, : fit.theta.size], J[:, fit.theta.size :]
+    Q, _ = np.linalg.qr(base / (np.sqrt(np.sum(base**2, axis=0)) + 1e-300))
+    rest = tangent - Q @ (Q.T @ tangent)
+    norm = float(np.linalg.norm(tangent))
+    if not norm > 0:
+        return None
+    share = float(np.linalg.norm(rest)) / norm
+    if share < 1e-5:  # wholly absorbed: what is left of the tangent is rounding
+        return None
+    U, S, V = np.linalg.svd(rest, full_matrices=False)
+    kept = 1e-8 * S[0] < S
+    basis = U[:, kept]
+    along = basis.T @ rho
+    step = -V[kept].T @ (along / S[kept])
+    drop = float(along @ along)
+    return ScoreTest(drop, step, share, chi2_tail(drop, basis.shape[1]), basis)
+
+
+def score_tests(
+    structure: Structure, data: Dataset, fit: Fit, effects: Sequence[Effect], executor: Executor
+) -> dict[str, ScoreTest]:
+    """Score tests by the effects' keys, of those that have one."""
+    found = executor.map(_score, [(structure, data, fit, e) for e in effects])
+    return {e.key: s for e, s in zip(effects, found, strict=True) if s is not None}
+
+
+def _score(item: tuple[Structure, Dataset, Fit, Effect]) -> ScoreTest | None:
+    return score_test(*item)
+
+
+def family_p(scores: Sequence[ScoreTest], seed: int = 0) -> float:
+    """How probable it is that noise alone makes the most extreme of all score tests as extreme.
+
+    Bootstrap of the smallest p-value: the tests share tangents, so their number overstates how
+    many there are (Bonferroni). Residuals of a model that is right are white and of unit variance,
+    ρ ~ N(0, I), and each drop is |basisᵀ ρ|². Where Bonferroni decides by itself, it is kept.
+    """
+    if not scores:
+        return 1.0
+    least = min(s.p_value for s in scores)
+    bound = min(1.0, len(scores) * least)
+    if not DECIDED < bound < 1.0:
+        return bound
+    rng = np.random.default_rng(seed)
+    together = np.concatenate([s.basis for s in scores], axis=1)
+    ends = np.cumsum([s.basis.shape[1] for s in scores])
+    more = 0
+    for _ in range(DRAWS // 1000):
+        squares = (rng.standard_normal((1000, together.shape[0])) @ together) ** 2
+        drops = np.diff(np.cumsum(squares, axis=1)[:, ends - 1], axis=1, prepend=0.0)
+        dofs = np.diff(ends, prepend=0)
+        more += int(np.sum(chi2_tails(drops, dofs).min(axis=1) <= least))
+    return min(bound, (more + 1) / (DRAWS + 1))

@@ -1,0 +1,160 @@
+"""The search: singles, run-to-run scatter, pairs and triples, and what contests them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from identify.dataset import Dataset
+from identify.effects import CANDIDATES
+from identify.effects.scatter import Scatter
+from identify.executor import Executor, InProcess
+from identify.fit import Fit, fit_orbits
+from identify.scatter import fit_scatter
+from identify.structure import Effect, Structure
+from identify.trace.contests import eliminate, in_other_forms, in_their_places, reformed, settled
+from identify.trace.scores import ScoreTest
+from identify.trace.stages import started_again, try_effects
+from identify.trace.tried import Tried, best_by_name, misfit, tried
+
+Progress = Callable[[float, str], None]
+
+GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
+
+
+class Cancelled(Exception):
+    """The search was cancelled by its caller."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """All that was tried, best first, and what it was tried against."""
+
+    tried: tuple[Tried, ...]
+    singles: tuple[Tried, ...]
+
+
+def search(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    *,
+    executor: Executor | None = None,
+    progress: Progress | None = None,
+    catalogue: Sequence[Effect] = CANDIDATES,
+    depth: int = 3,
+    scores: Mapping[str, ScoreTest] | None = None,
+) -> Search:
+    """Forward selection of up to `depth` effects with backward elimination.
+
+    `scores` are the candidates' tests at the base fit, where they are known already.
+    """
+    run = executor or InProcess()
+    report = progress or (lambda share, text: None)
+    scatters = [e for e in catalogue if isinstance(e, Scatter)]
+    available = [e for e in catalogue if usable(e, data, structure)]
+    singles = try_effects(
+        structure,
+        data,
+        base,
+        available,
+        executor=run,
+        keep=8,
+        far=base.chi2_per_dof > GROSS,
+        progress=lambda share, text: report(0.6 * share, text),
+        scores=scores,
+    )
+    if not any(t.adequate for t in singles) and base.chi2_per_dof > GROSS:
+        report(0.6, "starting the best once more from afar")
+        singles = started_again(singles, data, run)
+    singles = [*singles, *in_other_forms(singles, data, available)]
+    everything = list(singles)
+    if not any(t.explains for t in everything):
+        report(0.6, "trying run-to-run scatter")
+        everything += try_scatters(structure, data, base, scatters)
+    level = best_by_name(singles)
+    extended: set[tuple[str, ...]] = {()}
+    for _ in range(2, depth + 1):
+        # a spread does not end the search: a pair may explain the same without chance
+        if any(t.explains and t.spread is None for t in everything):
+            break
+        grown: list[Tried] = []
+        parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
+        for parent in parents:
+            extended.add(parent.key_of_forms)
+            rest = [e for e in available if e.name not in parent.names]
+            grown += try_effects(
+                parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,
+                progress=lambda share, text: report(0.6 + 0.35 * share, text),
+            )  # fmt: skip
+        if not grown:
+            break
+        if not any(t.adequate for t in grown) and base.chi2_per_dof > GROSS:
+            grown = started_again(grown, data, run)
+        if not any(t.explains for t in grown):
+            report(0.6, "trying other forms of the best")
+            grown += reformed(grown, data, available)
+        everything += [eliminate(t, data) for t in grown]
+        level = best_by_name(grown)
+        if len(parents[0].effects) == 1 and not any(t.explains for t in everything):
+            report(0.6, "trying run-to-run scatter beside an effect")
+            for parent in parents:
+                if parent.effects[0].location != "experiment":  # which would know of time
+                    everything += try_scatters(parent.fit.structure, data, parent.fit, scatters)
+    if not any(t.explains for t in everything):
+        everything += reformed([t for t in everything if t.spread is None], data, available)
+    everything += in_their_places(everything, data, available, run, extended, report)
+    everything += settled(everything, data, run)
+    return Search(
+        tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
+    )
+
+
+def try_scatters(
+    structure: Structure, data: Dataset, base: Fit, scatters: Sequence[Scatter]
+) -> list[Tried]:
+    """Each kind of random difference from run to run on top of `structure`."""
+    out = []
+    for s in scatters:
+        spread = fit_scatter(structure, data, base, s)
+        if spread is not None:
+            t = tried((*structure.effects, s), spread.fit, spread.data)
+            out.append(replace(t, spread=spread))
+    return out
+
+
+def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:
+    """The declared model fitted from where the best of `tries` ended, their effects left out.
+
+    None where nothing finite comes of it. Several effects that do equally well are often a sign
+    that the declared fit itself had ended in the wrong minimum.
+    """
+    count = len(structure.parameters)
+    best = sorted((t for t in tries if np.isfinite(t.fit.chi2)), key=misfit)[:4]
+    if not best:
+        return None
+    thetas = np.stack([t.fit.theta[:count] for t in best])
+    fit = fit_orbits(structure, data, thetas, continuation=(0.003, 0.0))
+    return fit if np.isfinite(fit.chi2) else None
+
+
+def refitted(tries: Sequence[Tried], data: Dataset, keep: int = 6) -> list[Tried]:
+    """The best of each set of effects fitted to `data`, whose covariances have changed, from where
+    they ended. A spread, which has widened its own data, is left out."""
+    best = [t for t in best_by_name(tries) if t.spread is None][:keep]
+    out = []
+    for t in best:
+        fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.0,))
+        if np.isfinite(fit.chi2):
+            out.append(tried(t.effects, fit, data))
+    return out
+
+
+def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
+    """Whether the effect can be added to this declared model and asked of these data."""
+    if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
+        return False
+    if effect.mode_count not in (None, structure.mode_count):
+        return False
+    pressure = any(np.any(b.at.pressure != 0) for b in data.fit)
+    return not ("pressure" in effect.needs and not pressure)

@@ -1,0 +1,353 @@
+"""Every effect added to a model, refitted in stages of falling noise; what falls behind drops out.
+
+The first stages run at noise of the misfit's own size: from the base fit (one Gauss–Newton step
+along the effect's tangent, projected off what the fit absorbs), and, where no effect stands out
+from there, from the slow flow corrected for the effect, because a gross effect drags the declared
+fit far away.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from identify import assess
+from identify.dataset import Dataset
+from identify.executor import Executor
+from identify.fit import Fit, fit_orbits
+from identify.start import (
+    CoarseStart,
+    candidates,
+    coarse,
+    corrected,
+    every_start,
+    physical_starts,
+    polish,
+)
+from identify.structure import Effect, Known, Structure
+from identify.trace.scores import ScoreTest, score_tests
+from identify.trace.tried import Tried, best_by_name, misfit, tried
+
+FloatArray = npt.NDArray[np.float64]
+
+AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
+REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
+SURELY = 4  # so many are refitted in any case
+ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
+FINE = 0.015  # share of noise below which all harmonics are looked at
+
+
+def known_sizes(data: Dataset, fit: Fit) -> Known:
+    """Sizes that starting values lean on."""
+    v = fit.values
+    n = fit.structure.mode_count
+    forced = [b for b in data.fit if not b.free]
+    velocity = float(np.median(np.concatenate([np.abs(b.measured[:, 0]) for b in forced])))
+    drive = float(np.max(np.concatenate([np.abs(b.at.drive[:, 0]) for b in forced])))
+    omega = np.concatenate([b.at.omega for b in forced]) / (2 * np.pi)
+    pole = 2 * np.pi * v.get("flame.pole_hz", data.free_hz)
+    return Known(
+        free_hz=data.free_hz,
+        modes_hz=tuple(v[f"mode{i}.frequency_hz"] for i in range(1, n + 1)),
+        modes_damping=tuple(v[f"mode{i}.damping"] for i in range(1, n + 1)),
+        flame_residues=tuple(v[f"mode{i}.flame_residue"] for i in range(1, n + 1)),
+        speaker_residues=tuple(v[f"mode{i}.speaker_residue"] for i in range(1, n + 1)),
+        flame_input_amplitude=velocity / abs(2j * np.pi * data.free_hz + pole),
+        velocity_amplitude=velocity,
+        drive_amplitude=drive,
+        band_hz=(float(omega.min()), float(omega.max())),
+        runs=sum(b.runs for b in data.fit),
+    )
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What a worker needs to try one effect on top of a structure."""
+
+    structure: Structure
+    data: Dataset
+    rough: Dataset
+    base: Fit
+    effect: Effect
+    known: Known
+    shares: tuple[float, float, float]  # of each coefficient's size that count as noise, by stage
+    score: ScoreTest | None
+    placements: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def seen(self) -> Dataset:
+        """What the first stages look at: all harmonics where the misfit is small."""
+        return self.rough if self.shares[0] > FINE else self.data
+
+    @property
+    def proposals(self) -> list[tuple[float, ...]]:
+        """The effect's own starting values."""
+        return [tuple(row) for row in self.effect.starts(self.known)]
+
+
+def louder(theta: FloatArray, names: Sequence[str], gain: float) -> FloatArray:
+    """Unknowns of these names, the speaker `gain` times as loud."""
+    spoken = [n.endswith("speaker_residue") for n in names]
+    return np.where(spoken, theta * gain, theta)
+
+
+def loudness(data: Dataset, effects: Sequence[Effect], p: Mapping[str, float]) -> float:
+    """What effects of these values make of the drive at the free frequency: a factor whose sign
+    is that of its real part (a resonance below it turns the sign), 1 where it says nothing."""
+    at = data.fit[0].at.take(np.array([0]))
+    s = np.array([[2j * np.pi * data.free_hz]])
+    gain = complex(np.prod([np.ravel(e.actuator(p, at, s))[0] for e in effects]))
+    signed = float(np.copysign(abs(gain), gain.real))
+    return signed if np.isfinite(signed) and signed != 0 else 1.0
+
+
+def beside(
+    structure: Structure,
+    theta: FloatArray,
+    data: Dataset,
+    effect: Effect,
+    values: Sequence[float],
+) -> FloatArray:
+    """Unknowns of `structure` as they are with one more effect of these values: as loud."""
+    p = {q.name: v for q, v in zip(effect.parameters, values, strict=True)}
+    return louder(theta, structure.parameters.names, 1 / loudness(data, [effect], p))
+
+
+def _first_stage(task: _Task) -> list[CoarseStart]:
+    """The best starts of one effect near the base fit at the first share of noise, best first."""
+    larger = task.structure.with_effects(task.effect)
+    own = task.effect.parameters
+    inner = [[q.to_internal(v) for q, v in zip(own, row, strict=True)] for row in task.proposals]
+    thetas = [
+        np.r_[beside(task.structure, task.base.theta, task.data, task.effect, values), row]
+        for values, row in zip(task.proposals, inner, strict=True)
+    ]
+    neutral = task.effect.neutral()
+    if neutral is not None:  # never worse than without the effect
+        still = [q.to_internal(v) for q, v in zip(own, neutral, strict=True)]
+        thetas.append(np.r_[task.base.theta, still])
+    if task.score is not None:
+        bound = 20 * np.max(np.abs(inner), axis=0) + 1e-12
+        thetas.append(np.r_[task.base.theta, np.clip(task.score.size, -bound, bound)])
+    first = task.shares[0]
+    starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
+    richer = None if task.structure.effects else task.effect.restated(task.structure)
+    if richer is not None:
+        found = every_start(richer, task.rough)[:6]
+        restated = [
+            task.effect.from_restated(task.structure, richer.parameters.plain(s.theta))
+            for s in found
+        ]
+        rows = [larger.parameters.to_internal(v) for v in restated]
+        starts += polish(larger, task.rough, coarse(larger, task.rough, rows), (ROUGH,), 8)[:2]
+    return polish(larger, task.seen, starts, (first,), 8)[:3]
+
+
+def _from_afar(task: _Task) -> list[CoarseStart]:
+    """The same from the slow flow corrected for the effect, wherever the base fit is."""
+    larger = task.structure.with_effects(task.effect)
+    inherited = [task.base.values[q.name] for e in task.structure.effects for q in e.parameters]
+    rows = [[*inherited, *row] for row in task.proposals]
+    starts = physical_starts(larger, task.rough, rows, task.placements)[:4]
+    led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
+    return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
+
+
+def _middle_stage(item: tuple[_Task, list[CoarseStart]]) -> list[CoarseStart]:
+    """The survivors' starts at the second share of noise, best first."""
+    task, starts = item
+    larger = task.structure.with_effects(task.effect)
+    return polish(larger, task.seen, starts, shares=(task.shares[1],), iterations=10)[:2]
+
+
+def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
+    task, starts = item
+    larger = task.structure.with_effects(task.effect)
+    thetas = np.stack([s.theta for s in starts])
+    fit = fit_orbits(larger, task.data, thetas, continuation=(task.shares[2], 0.0))
+    return _canonical(fit, task.data)
+
+
+def _canonical(fit: Fit, data: Dataset) -> Fit:
+    """The same fit with its effects' parameters named by the effects' own rules."""
+    structure = fit.structure
+    plain = replace(structure, effects=())
+    for effect in structure.effects:
+        if not fit.converged or effect.restated(plain) is None:
+            continue
+        named = effect.from_restated(plain, effect.to_restated(plain, fit.values))
+        names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
+        values = {**fit.values, **dict(zip(names, named, strict=True))}
+        theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+        if np.allclose(theta, fit.theta, rtol=1e-9, atol=1e-12):
+            continue
+        renamed = fit_orbits(structure, data, theta, continuation=(0.0,))
+        # beside an effect that speaks of the modes by number, another name is another model
+        if renamed.converged and renamed.chi2 < fit.chi2 + 1.0:
+            fit = renamed
+    return fit
+
+
+def shares_of(base: Fit, data: Dataset) -> tuple[float, float, float]:
+    """Noise of the stages as shares of each coefficient's size: of the size of the misfit.
+
+    Much coarser, and an effect that explains it does no better than one that does not.
+    """
+    misfit = assess.relative_error(
+        [assess.predict(base.structure, base.theta, b) for b in data.fit]
+    )
+    first = float(np.clip(2 * misfit, 1e-4, ROUGH)) if np.isfinite(misfit) else ROUGH
+    return first, first / 5, min(0.003, first / 15)
+
+
+def _one_stands_out(costs: Sequence[float], share: float) -> bool:
+    """Whether one effect takes away nearly all that the usual one leaves, seen at all harmonics."""
+    return share <= FINE and bool(costs) and min(costs) < float(np.median(costs)) / REACH
+
+
+def try_effects(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    effects: Sequence[Effect],
+    *,
+    executor: Executor,
+    keep: int,
+    far: bool,
+    progress: Callable[[float, str], None],
+    scores: Mapping[str, ScoreTest] | None = None,
+) -> list[Tried]:
+    """Each effect added to `structure`; the best `keep` are refitted in full, best first.
+
+    Started near the `base` fit; with `far` from the slow flow too, where none comes of that.
+    `scores` are the effects' tests at the base fit, where they are known already.
+    """
+    if scores is None:
+        scores = score_tests(structure, data, base, effects, executor)
+    known = known_sizes(data, base)
+    rough = data.coarse()
+    shares = shares_of(base, data)
+    tasks = [
+        _Task(structure, data, rough, base, e, known, shares, scores.get(e.key)) for e in effects
+    ]
+    staged: list[tuple[_Task, list[CoarseStart]]] = []
+    for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
+        staged.append((task, starts))
+        progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
+    if far and not _one_stands_out([s[0].cost for _, s in staged if s], shares[0]):
+        placements = _likely_placements(replace(structure, effects=()), rough)
+        tasks = [replace(t, placements=placements) for t in tasks]
+        for i, starts in enumerate(executor.map(_from_afar, tasks)):
+            both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
+            staged[i] = (tasks[i], both)
+            progress(0.3 + (i + 1) / len(tasks) * 0.2, f"trying {tasks[i].effect.key} from afar")
+    better = _heats(staged, 5 * keep // 2)
+    refined: list[tuple[_Task, list[CoarseStart]]] = []
+    for (task, _), starts in zip(better, executor.map(_middle_stage, better), strict=True):
+        refined.append((task, starts))
+        progress(0.5 + len(refined) / len(better) * 0.2, f"refining {task.effect.key}")
+
+    def refit(
+        chosen: Sequence[tuple[_Task, list[CoarseStart]]], first: float, last: float
+    ) -> list[Tried]:
+        out = []
+        for i, fit in enumerate(executor.map(_second_stage, chosen), start=1):
+            effect = chosen[i - 1][0].effect
+            progress(first + i / len(chosen) * (last - first), f"refitting with {effect.key}")
+            if np.isfinite(fit.chi2):
+                out.append(tried((*structure.effects, effect), fit, data))
+        return out
+
+    # two forms of an effect at the most, so that other effects get their turn: first those within
+    # reach of the best …
+    chosen = _best(refined, keep, forms=2)
+    costs = [starts[0].cost for _, starts in chosen]  # ascending
+    near = max(SURELY, sum(cost <= REACH * costs[0] for cost in costs))
+    out = refit(chosen[:near], 0.7, 0.85)
+    if not any(t.explains for t in out):
+        out += refit(chosen[near:], 0.85, 0.95)
+    # … and then all forms of the best two: at coarse noise they could not be told apart
+    if not any(t.explains for t in out):
+        poor = [t for t in sorted(out, key=misfit) if not t.adequate]
+        names = list(dict.fromkeys(t.effects[-1].name for t in poor))[:2]
+        done = {task.effect.key for task, _ in chosen}
+        reached = {t.effect.key: s for t, s in refined if s}
+        rest = [
+            (t, reached.get(t.effect.key, s[:2]))
+            for t, s in staged
+            if s and t.effect.name in names and t.effect.key not in done
+        ]
+        out += refit(rest, 0.95, 1.0)
+    return sorted(out, key=misfit)
+
+
+def started_again(singles: Sequence[Tried], data: Dataset, executor: Executor) -> list[Tried]:
+    """The best of each effect started once more as if its values were known.
+
+    A gross effect leads the fit of everything else astray, yet is often nearly right itself: with
+    the data corrected for it, the declared model's own starting values serve again.
+    """
+    best = [t for t in best_by_name(singles) if t.fit.chi2_per_dof > AGAIN][:4]
+    again = [
+        tried(t.effects, fit, data)
+        for t, fit in zip(best, executor.map(_again, [(t, data) for t in best]), strict=True)
+        if np.isfinite(fit.chi2) and fit.chi2 < t.fit.chi2
+    ]
+    return sorted([*singles, *again], key=misfit)
+
+
+def _again(item: tuple[Tried, Dataset]) -> Fit:
+    t, data = item
+    larger, plain = t.fit.structure, replace(t.fit.structure, effects=())
+    values = t.fit.values
+    row = [values[q.name] for e in t.effects for q in e.parameters]
+    own = t.fit.theta[len(plain.parameters) :]
+    rough = data.coarse()
+    clean = corrected(data, t.effects, values)
+    exact = [] if clean is None else [np.r_[theta, own] for theta in candidates(plain, clean)]
+    starts = coarse(larger, rough, exact)[:5] + physical_starts(larger, rough, [row])[:5]
+    polished = polish(larger, rough, starts, shares=(0.05, 0.01), iterations=10)[:3]
+    thetas = np.stack([*(s.theta for s in polished), t.fit.theta])
+    return fit_orbits(larger, data, thetas, continuation=(0.003, 0.0), iterations=100)
+
+
+def _best(
+    staged: Sequence[tuple[_Task, list[CoarseStart]]], keep: int, forms: int
+) -> list[tuple[_Task, list[CoarseStart]]]:
+    """The `keep` most promising, no more than `forms` of one effect."""
+    out: list[tuple[_Task, list[CoarseStart]]] = []
+    for item in sorted((s for s in staged if s[1]), key=lambda s: s[1][0].cost):
+        same = sum(o[0].effect.name == item[0].effect.name for o in out)
+        if same < forms:
+            out.append(item)
+    return out[:keep]
+
+
+def _heats(
+    staged: Sequence[tuple[_Task, list[CoarseStart]]], keep: int
+) -> list[tuple[_Task, list[CoarseStart]]]:
+    """The best form of every effect, and the most promising of the others up to `keep` in all.
+
+    At five per cent noise nearly all do well: no effect may drop out for having few forms.
+    """
+    firsts = _best(staged, len(staged), forms=1)
+    taken = {task.effect.key for task, _ in firsts}
+    others = [s for s in _best(staged, len(staged), forms=3) if s[0].effect.key not in taken]
+    return [*firsts, *others[: max(keep - len(firsts), 0)]]
+
+
+def _likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float, ...], ...]:
+    """Positions of the other modes (over the free frequency) of the best coarse starts."""
+    if structure.mode_count == 1:
+        return ((),)
+    out: list[tuple[float, ...]] = []
+    for start in physical_starts(structure, data)[:20]:
+        values = structure.parameters.plain(start.theta)
+        ratio = tuple(
+            round(values[f"mode{i}.frequency_hz"] / data.free_hz, 6)
+            for i in range(2, structure.mode_count + 1)
+        )
+        if ratio not in out:
+            out.append(ratio)
+    return tuple(out[:2])

@@ -1,0 +1,180 @@
+"""A set of effects refitted, and how such sets compare: which explain, which is best, which rival.
+
+Selection is by lack of fit and held-out runs with corrected significance; information criteria
+only weigh candidates that are adequate already: χ² + p ln n, within 10 of the best.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from identify import assess
+from identify.chances import chi2_tail
+from identify.dataset import Dataset
+from identify.fit import Fit
+from identify.parameters import Estimate
+from identify.results import Candidate
+from identify.scatter import Spread
+from identify.structure import Effect
+
+ALPHA = 1e-3  # false-alarm probability of each significance test
+EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
+PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
+
+
+@dataclass(frozen=True)
+class Tried:
+    """One set of effects, refitted."""
+
+    effects: tuple[Effect, ...]
+    fit: Fit
+    validation_error: float
+    fit_p: float
+    validation_p: float
+    spread: Spread | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.effects)
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        return tuple(sorted(self.names))
+
+    @property
+    def key_of_forms(self) -> tuple[str, ...]:
+        return tuple(sorted(e.key for e in self.effects))
+
+    @property
+    def adequate(self) -> bool:
+        return self.fit_p > ALPHA and not self.validation_p < ALPHA
+
+    @property
+    def explains(self) -> bool:
+        """Adequate, and with values that can be true."""
+        return self.adequate and self.plausible
+
+    @property
+    def evidence(self) -> float:
+        """χ² + p ln n: only compared between adequate candidates."""
+        n, p, cost = self.fit.residual.size, self.fit.theta.size, 0.0
+        if self.spread is not None:
+            p, cost = p + len(self.spread.sizes), self.spread.penalty
+        return self.fit.chi2 + cost + p * float(np.log(n))
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        own = {} if self.spread is None else self.spread.sizes
+        return {**self.fit.estimates, **own}
+
+    @property
+    def plausible(self) -> bool:
+        if self.spread is not None and self.spread.objection:
+            return False
+        values = {name: e.value for name, e in self.estimates.items()}
+        inside = all(q.plausible(values[q.name]) for e in self.effects for q in e.parameters)
+        return inside and all(
+            values[f"mode{i}.damping"] < 0.7 for i in range(1, self.fit.structure.mode_count + 1)
+        )
+
+
+def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
+    """A refitted candidate with its adequacy on fitted and held-out runs."""
+    held_out = [assess.predict(fit.structure, fit.theta, b) for b in data.validation]
+    if held_out:
+        error = assess.relative_error(held_out)
+        p_out = assess.validation_p(held_out, fit.covariance)
+    else:
+        error, p_out = float("nan"), float("nan")
+    return Tried(effects, fit, error, assess.lack_of_fit_p(fit.chi2, fit.dof), p_out)
+
+
+def best_by_name(tries: Sequence[Tried]) -> list[Tried]:
+    """The best form of each set of effect names, best first."""
+    best: dict[tuple[str, ...], Tried] = {}
+    for t in sorted(tries, key=_merit):
+        best.setdefault(t.key, t)
+    return sorted(best.values(), key=misfit)
+
+
+def misfit(t: Tried) -> float:
+    return t.fit.chi2
+
+
+def best_form(good: Sequence[Tried]) -> Tried:
+    """The best of adequate candidates, in its preferred form."""
+    best = min(good, key=lambda t: t.evidence)
+    return min((t for t in good if t.key == best.key), key=_merit)
+
+
+def _merit(t: Tried) -> tuple[bool, float]:
+    """Adequate ones first, by evidence; the others by misfit."""
+    good = t.explains
+    handicap = PREFERENCE if any(e.empirical for e in t.effects) else 0.0
+    return not good, t.evidence + handicap if good else t.fit.chi2
+
+
+def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
+    """Adequate, plausible sets of other effects that the data do not rule out against `best`.
+
+    What only adds an effect to one of them is none of its own.
+    """
+    found = [
+        t
+        for t in others
+        if t.key != best.key
+        and t.explains
+        and t.evidence < best.evidence + EVIDENCE
+        and not set(best.names) < set(t.names)
+        and not _extends(t, best)
+    ]
+    return [t for t in found if not any(set(o.names) < set(t.names) for o in found)]
+
+
+def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ...]]:
+    """By effect, its other forms that the data do not rule out against those of `best`."""
+    out: dict[str, list[str]] = {name: [] for name in best.names}
+    for t in others:
+        if t.key != best.key or not t.explains:
+            continue
+        if t.evidence < best.evidence + EVIDENCE:
+            for e in t.effects:
+                out[e.name].append(e.form)
+    own = {e.name: e.form for e in best.effects}
+    return {n: tuple(f for f in dict.fromkeys(forms) if f != own[n]) for n, forms in out.items()}
+
+
+def _extends(t: Tried, best: Tried) -> bool:
+    """Whether `t` is `best` with an extension that the data do not ask for."""
+    general = {n for e in t.effects for n in e.generalises}
+    return t.fit.theta.size > best.fit.theta.size and set(best.names) <= set(t.names) | general
+
+
+def candidate(
+    t: Tried, smaller_chi2: float, smaller_p: int, tests: int, equal: Sequence[str]
+) -> Candidate:
+    """The candidate's line of the report: its gain over the declared model, corrected."""
+    freedom = max(t.fit.theta.size - smaller_p, 1)
+    raw = chi2_tail(smaller_chi2 - t.fit.chi2, freedom)
+    own = {q.name for e in t.effects for q in e.parameters}
+    return Candidate(
+        effects=t.names,
+        forms=tuple(e.form for e in t.effects),
+        locations=tuple(e.location for e in t.effects),
+        chi2=t.fit.chi2,
+        chi2_per_dof=t.fit.chi2_per_dof,
+        validation_error=t.validation_error,
+        p_value=min(1.0, raw * tests),
+        parameters={n: e for n, e in t.estimates.items() if n in own},
+        equivalent_to=tuple(equal),
+        plausible=t.plausible,
+        adequate=t.adequate,
+        note=_note(t),
+    )
+
+
+def _note(t: Tried) -> str:
+    if not t.fit.converged:
+        return t.fit.reason
+    return "" if t.spread is None else t.spread.objection
