@@ -20,15 +20,17 @@ MOST = 14  # candidates shown; the table has them all
 def ranking(d: Diagnosis) -> Figure:
     """χ² per degree of freedom and validation error of each candidate beside the declared model."""
     candidates = d.candidates[:MOST]
-    names = ["declared model", *(label(c) for c in candidates)]
+    # one effect a line: several in a row would leave the bars no room
+    names = ["declared model", *(label(c).replace(" + ", " +\n") for c in candidates)]
     chi2 = np.array([d.before.chi2_per_dof, *(c.chi2_per_dof for c in candidates)])
     errors = np.array([d.before.validation_error, *(c.validation_error for c in candidates)])
     colours = [theme.BEFORE, *(_colour(c, d) for c in candidates)]
     y = np.arange(len(names))
-    longest = max(len(n) for n in names)
+    longest = max(len(line) for n in names for line in n.split("\n"))
+    row = 0.1 + 0.14 * max(n.count("\n") + 1 for n in names)
     margins = theme.Margins(left=0.3 + 0.062 * longest, across=0.15)
     figure, axes = theme.panels(
-        0.75 + 0.24 * len(names), 1, 2, margins, widths=(1.4, 1), sharey=True
+        0.75 + row * len(names), 1, 2, margins, widths=(1.4, 1), sharey=True
     )
     left, right = axes[0]
     _bars(left, names, chi2, colours)

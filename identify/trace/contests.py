@@ -23,7 +23,8 @@ from identify.trace.tried import ALPHA, EVIDENCE, Tried, best_by_name, best_form
 Progress = Callable[[float, str], None]
 
 UNSETTLED = 60.0  # the same for a fit that has not converged
-REFORMED = 3  # sets of effects of which other forms are tried
+REFORMED = 3  # sets of effects of which other forms are tried …
+NEARLY = 10.0  # … where they leave no more than so much χ²/dof
 
 
 def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
@@ -62,7 +63,7 @@ def eliminate(candidate: Tried, data: Dataset) -> Tried:
 
 
 def in_other_forms(
-    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect]
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
 ) -> list[Tried]:
     """The other forms of the effects of the best of `tries`, started from where it ended.
 
@@ -73,44 +74,50 @@ def in_other_forms(
     best = min(good, key=lambda t: t.evidence) if good else min(tries, key=misfit, default=None)
     if best is None:
         return []
-    known = known_sizes(data, best.fit)
-    done = {t.key_of_forms for t in tries if t.adequate}
-    out = []
+    done = {t.key_of_forms for t in tries if t.adequate} | {best.key_of_forms}
+    items = []
     for e in best.effects:
         kept = tuple(o for o in best.effects if o is not e)
-        base = part_of(best, kept, data)
         for form in available:
             forms = tuple(sorted(o.key for o in (*kept, form)))
-            if form.name != e.name or form.key == e.key or forms in done:
-                continue
-            larger = base.structure.with_effects(form)
-            rows = form.starts(known)
-            if [q.unit for q in form.parameters] == [q.unit for q in e.parameters]:
-                rows = [*rows, tuple(best.fit.values[q.name] for q in e.parameters)]
-            thetas = [
-                np.r_[
-                    beside(base.structure, base.theta, data, form, row),
-                    [q.to_internal(v) for q, v in zip(form.parameters, row, strict=True)],
-                ]
-                for row in rows
-            ]
-            found = coarse(larger, data, thetas)[:2]
-            if not found:
-                continue
-            starts = np.stack([s.theta for s in found])
-            fit = fit_orbits(larger, data, starts, continuation=(0.003, 0.0), iterations=30)
-            if np.isfinite(fit.chi2):
-                out.append(tried(larger.effects, fit, data))
-    return out
+            if form.name == e.name and forms not in done:
+                items.append((best, e, form, data))
+    fits = run.map(_in_form, items)
+    return [tried(f.structure.effects, f, data) for f in fits if f and np.isfinite(f.chi2)]
 
 
-def reformed(grown: Sequence[Tried], data: Dataset, available: Sequence[Effect]) -> list[Tried]:
-    """Other forms of the best few sets, one after the other for as long as that helps."""
+def _in_form(item: tuple[Tried, Effect, Effect, Dataset]) -> Fit | None:
+    """`t` with one of its effects in another form; None where it starts nowhere."""
+    t, old, form, data = item
+    base = part_of(t, tuple(o for o in t.effects if o is not old), data)
+    rows = form.starts(known_sizes(data, t.fit))
+    if [q.unit for q in form.parameters] == [q.unit for q in old.parameters]:
+        rows = [*rows, tuple(t.fit.values[q.name] for q in old.parameters)]
+    thetas = [
+        np.r_[
+            beside(base.structure, base.theta, data, form, row),
+            [q.to_internal(v) for q, v in zip(form.parameters, row, strict=True)],
+        ]
+        for row in rows
+    ]
+    larger = base.structure.with_effects(form)
+    starts = coarse(larger, data, thetas)[:2]
+    if not starts:
+        return None
+    first = np.stack([s.theta for s in starts])
+    return fit_orbits(larger, data, first, continuation=(0.003, 0.0), iterations=30)
+
+
+def reformed(
+    grown: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """Other forms of the best few sets near to the noise, one after the other while that helps."""
     out: list[Tried] = []
-    for t in best_by_name(grown)[:REFORMED]:
+    near = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEARLY]
+    for t in near[:REFORMED]:
         current = t
-        for _ in range(len(t.effects) + 1):
-            found = in_other_forms([current], data, available)
+        for _ in t.effects:
+            found = in_other_forms([current], data, available, run)
             out += found
             best = min(found, key=misfit, default=current)
             if best.explains or not best.fit.chi2 < current.fit.chi2 - EVIDENCE:

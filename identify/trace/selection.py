@@ -67,7 +67,7 @@ def search(
     if not any(t.adequate for t in singles) and base.chi2_per_dof > GROSS:
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
-    singles = [*singles, *in_other_forms(singles, data, available)]
+    singles = [*singles, *in_other_forms(singles, data, available, run)]
     everything = list(singles)
     if not any(t.explains for t in everything):
         report(0.6, "trying run-to-run scatter")
@@ -93,7 +93,7 @@ def search(
             grown = started_again(grown, data, run)
         if not any(t.explains for t in grown):
             report(0.6, "trying other forms of the best")
-            grown += reformed(grown, data, available)
+            grown += reformed(grown, data, available, run)
         everything += [eliminate(t, data) for t in grown]
         level = best_by_name(grown)
         if len(parents[0].effects) == 1 and not any(t.explains for t in everything):
@@ -102,7 +102,7 @@ def search(
                 if parent.effects[0].location != "experiment":  # which would know of time
                     everything += try_scatters(parent.fit.structure, data, parent.fit, scatters)
     if not any(t.explains for t in everything):
-        everything += reformed([t for t in everything if t.spread is None], data, available)
+        everything += reformed([t for t in everything if t.spread is None], data, available, run)
     everything += in_their_places(everything, data, available, run, extended, report)
     everything += settled(everything, data, run)
     return Search(

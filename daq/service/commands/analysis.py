@@ -263,8 +263,8 @@ def show_diagnosis(found: "Diagnosis") -> None:
             ("effects", "where", "χ²/dof", "validation error", "p of the gain"),
             (
                 (
-                    " + ".join(c.effects),
-                    ", ".join(c.locations),
+                    " +\n".join(c.effects),  # one a line: three would leave no room
+                    "\n".join(c.locations),
                     number(c.chi2_per_dof),
                     number(c.validation_error, 3),
                     chance(c.p_value),

@@ -1,6 +1,7 @@
 """What the commands share: the console, the store in force, tables, JSON files, errors' exits."""
 
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -71,7 +72,7 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) 
 
 def number(value: float | None, digits: int = 4) -> str:
     """A number as tables show it."""
-    return "–" if value is None else f"{value:.{digits}g}"
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
 
 
 def chance(p: float) -> str:
