@@ -309,6 +309,8 @@ class Whereabouts:
     @property
     def words(self) -> str:
         """One sentence."""
+        if not self.left:
+            return "Where it lies is not known: no freely shaped piece could be fitted."
         listed = ", ".join(f"{place} {left:.3g}" for place, left in self.left.items())
         sizes = f"χ²/dof {self.before:.3g}; with a freely shaped piece in one place: {listed}"
         if not self.likely:

@@ -66,15 +66,15 @@ def whereabouts(
     found: list[Tried] = []
     for piece, fit in zip(pieces, executor.map(_shape, items), strict=True):
         progress((len(found) + 1) / len(pieces), f"shaping the {piece.location} freely")
-        if np.isfinite(fit.chi2):
+        if fit is not None and np.isfinite(fit.chi2):
             found.append(as_tried((piece,), fit, data))
     places = sorted(found, key=lambda t: t.fit.chi2)
     left = {_place(t): t.fit.chi2_per_dof for t in places}
     return Whereabouts(_likely(places, base.chi2_per_dof), left, base.chi2_per_dof)
 
 
-def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit:
-    """The best fit of a structure with one piece, from several fits without it."""
+def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit | None:
+    """The best fit of a structure with one piece, from several fits without it, if any starts."""
     structure, data, bases = item
     piece = structure.effects[0]
     fits = []
@@ -86,4 +86,4 @@ def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit:
         if starts:
             thetas = np.stack([s.theta for s in starts])
             fits.append(fit_orbits(structure, data, thetas, continuation=(first, *others, 0.0)))
-    return min(fits, key=lambda f: f.chi2)
+    return min(fits, key=lambda f: f.chi2, default=None)
