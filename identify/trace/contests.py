@@ -109,14 +109,24 @@ def _in_form(item: tuple[Tried, Effect, Effect, Dataset]) -> Fit | None:
 
 
 def reformed(
-    grown: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+    grown: Sequence[Tried],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    done: set[tuple[str, ...]],
 ) -> list[Tried]:
-    """Other forms of the best few sets near to the noise, one after the other while that helps."""
+    """Other forms of the best few sets near to the noise, one after the other while that helps.
+
+    Those in `done` (keys of forms) have had theirs; what is seen to here joins them.
+    """
     out: list[Tried] = []
     near = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEARLY]
     for t in near[:REFORMED]:
         current = t
         for _ in t.effects:
+            if current.key_of_forms in done:
+                break
+            done.add(current.key_of_forms)
             found = in_other_forms([current], data, available, run)
             out += found
             best = min(found, key=misfit, default=current)

@@ -74,9 +74,10 @@ def search(
         everything += try_scatters(structure, data, base, scatters)
     level = best_by_name(singles)
     extended: set[tuple[str, ...]] = {()}
+    done: set[tuple[str, ...]] = set()
     for _ in range(2, depth + 1):
-        # a spread does not end the search: a pair may explain the same without chance
-        if any(t.explains and t.spread is None for t in everything):
+        # a spread alone does not end the search: a pair may explain the same without chance
+        if any(t.explains and (t.spread is None or len(t.effects) > 1) for t in everything):
             break
         grown: list[Tried] = []
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
@@ -93,7 +94,7 @@ def search(
             grown = started_again(grown, data, run)
         if not any(t.explains for t in grown):
             report(0.6, "trying other forms of the best")
-            grown += reformed(grown, data, available, run)
+            grown += reformed(grown, data, available, run, done)
         everything += [eliminate(t, data) for t in grown]
         level = best_by_name(grown)
         if len(parents[0].effects) == 1 and not any(t.explains for t in everything):
@@ -102,7 +103,8 @@ def search(
                 if parent.effects[0].location != "experiment":  # which would know of time
                     everything += try_scatters(parent.fit.structure, data, parent.fit, scatters)
     if not any(t.explains for t in everything):
-        everything += reformed([t for t in everything if t.spread is None], data, available, run)
+        certain = [t for t in everything if t.spread is None]
+        everything += reformed(certain, data, available, run, done)
     everything += in_their_places(everything, data, available, run, extended, report)
     everything += settled(everything, data, run)
     return Search(
