@@ -274,6 +274,8 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> st
         if np.max(x[:, j] ** 2) > ONE_RUN * np.sum(x[:, j] ** 2):
             return f"{q.name}: a single run deviates"
         for word, values in known.items():
+            if word == "time" and scatter.location == "experiment":
+                continue  # what wanders with time is what it says
             if np.ptp(values) > 0 and rank_correlation(x[:, j], values)[1] < TREND_P:
                 return f"{q.name} follows the {word}: no chance"
     return ""

@@ -19,6 +19,7 @@ from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.scatter import fit_scatter
 from identify.trace.places import whereabouts
+from identify.trace.selection import against_chance, try_scatters
 from identify.trace.stages import known_sizes
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
@@ -349,3 +350,16 @@ def test_unexplained_says_where(tmp_path: Path) -> None:
     assert found.to_json()["whereabouts"]["likely"] == ["flame"]
     assert "lies in the flame path" in found.explanation
     assert "places" in [path.stem for path in save_figures(tmp_path / "figures", found)]
+
+
+def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
+    """A spread beside an effect is not claimed where a law explains the data with less."""
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
+    base = start.fit_from_data(ready.structure, ready.data)
+    law = trace.try_effects(
+        ready.structure, ready.data, base, [by_key("flame_delay")], executor=InProcess(), keep=1,
+        far=False, progress=lambda share, text: None,
+    )[0]  # fmt: skip
+    beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME])[0]
+    kept = against_chance([beside])[0]
+    assert (kept.plausible, against_chance([law, beside])[1].plausible) == (True, False)

@@ -101,15 +101,46 @@ def search(
             report(0.6, "trying run-to-run scatter beside an effect")
             for parent in parents:
                 if parent.effects[0].location != "experiment":  # which would know of time
-                    everything += try_scatters(parent.fit.structure, data, parent.fit, scatters)
+                    found = try_scatters(parent.fit.structure, data, parent.fit, scatters)
+                    everything += [*found, *_without_chance(found, data)]
     if not any(t.explains for t in everything):
         certain = [t for t in everything if t.spread is None]
         everything += reformed(certain, data, available, run, done)
     everything += in_their_places(everything, data, available, run, extended, report)
     everything += settled(everything, data, run)
+    everything = against_chance(everything)
     return Search(
         tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
     )
+
+
+def against_chance(tries: Sequence[Tried]) -> list[Tried]:
+    """A law that does better than a spread beside an effect speaks against chance, even one of
+    implausible values: it stands for one that is not known."""
+    laws = [t.evidence for t in tries if t.spread is None and t.adequate]
+    least = min(laws, default=np.inf)
+    out = []
+    for t in tries:
+        if t.spread is not None and len(t.effects) > 1 and t.evidence > least:
+            spread = replace(t.spread, objection=t.spread.objection or "a law does better")
+            out.append(replace(t, spread=spread))
+        else:
+            out.append(t)
+    return out
+
+
+def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
+    """Effects beside a spread that explains the data, fitted from there without it.
+
+    A spread forgives the runs that had led the effect astray, and may have been needed for no more.
+    """
+    out = []
+    for t in tries:
+        if t.explains:
+            fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.003, 0.0))
+            if np.isfinite(fit.chi2):
+                out.append(tried(t.fit.structure.effects, fit, data))
+    return out
 
 
 def try_scatters(
