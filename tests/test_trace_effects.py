@@ -18,7 +18,7 @@ from identify.load import load_campaign
 from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.scatter import fit_scatter
-from identify.trace.places import whereabouts
+from identify.trace.places import shaped, whereabouts
 from identify.trace.selection import against_chance, try_scatters
 from identify.trace.stages import known_sizes
 from simulated_rig import build_config
@@ -333,9 +333,8 @@ def test_what_no_candidate_explains_is_placed(
     values = parameters or {n: float(v["value"]) for n, v in drawn.parameters().items()}
     ready = thesis_campaign(tmp_path, 7, {key: values})
     base = start.fit_from_data(ready.structure, ready.data)
-    found = whereabouts(
-        ready.structure, ready.data, base, [], InProcess(), lambda share, text: None
-    )
+    pieces = shaped(ready.structure, ready.data, base, [], InProcess(), lambda share, text: None)
+    found = whereabouts(pieces, base)
     assert found.likely == (place,), found.words
     assert place in found.words or "sensors" in found.words
 

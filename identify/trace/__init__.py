@@ -14,9 +14,17 @@
    (`places`).
 """
 
-from identify.trace.places import whereabouts
+from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
-from identify.trace.selection import GROSS, Cancelled, refitted, search, usable, without_effects
+from identify.trace.selection import (
+    GROSS,
+    Cancelled,
+    against_chance,
+    refitted,
+    search,
+    usable,
+    without_effects,
+)
 from identify.trace.stages import started_again, try_effects
 from identify.trace.tried import (
     ALPHA,
@@ -36,6 +44,7 @@ __all__ = [
     "Cancelled",
     "ScoreTest",
     "Tried",
+    "against_chance",
     "best_by_name",
     "best_form",
     "candidate",
@@ -45,6 +54,7 @@ __all__ = [
     "rivals",
     "score_tests",
     "search",
+    "shaped",
     "started_again",
     "try_effects",
     "usable",

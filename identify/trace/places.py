@@ -49,16 +49,16 @@ def _likely(places: Sequence[Tried], before: float) -> tuple[str, ...]:
     )
 
 
-def whereabouts(
+def shaped(
     structure: Structure,
     data: Dataset,
     base: Fit,
     tried: Sequence[Tried],
     executor: Executor,
     progress: Callable[[float, str], None],
-) -> Whereabouts:
+) -> list[Tried]:
     """A piece at each place, started from the declared fit and from what the best of `tried` make
-    of the declared model."""
+    of the declared model; best first."""
     pieces = [p for p in (piece(data.free_hz) for piece in PIECES) if usable(p, data, structure)]
     best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]
     bases = [base, *(part_of(t, (), data) for t in best)]
@@ -68,7 +68,11 @@ def whereabouts(
         progress((len(found) + 1) / len(pieces), f"shaping the {piece.location} freely")
         if fit is not None and np.isfinite(fit.chi2):
             found.append(as_tried((piece,), fit, data))
-    places = sorted(found, key=lambda t: t.fit.chi2)
+    return sorted(found, key=lambda t: t.fit.chi2)
+
+
+def whereabouts(places: Sequence[Tried], base: Fit) -> Whereabouts:
+    """Where a misfit lies, from what the pieces (`shaped`) leave of that of the fit `base`."""
     left = {_place(t): t.fit.chi2_per_dof for t in places}
     return Whereabouts(_likely(places, base.chi2_per_dof), left, base.chi2_per_dof)
 

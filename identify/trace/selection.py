@@ -114,10 +114,10 @@ def search(
     )
 
 
-def against_chance(tries: Sequence[Tried]) -> list[Tried]:
+def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
     """A law that does better than a spread beside an effect speaks against chance, even one of
-    implausible values: it stands for one that is not known."""
-    laws = [t.evidence for t in tries if t.spread is None and t.adequate]
+    implausible values, or one of `others`: it stands for one that is not known."""
+    laws = [t.evidence for t in (*tries, *others) if t.spread is None and t.adequate]
     least = min(laws, default=np.inf)
     out = []
     for t in tries:
