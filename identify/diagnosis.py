@@ -8,6 +8,7 @@ runs never touches the harmonics compared; it is an effect of the sensors found 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -106,18 +107,25 @@ def diagnose(
     )
     if not declared.significant:
         tried = []
-    shaping = _Shaping(ready.structure, data, base, run, report)
+
+    @cache
+    def pieces() -> list[Tried]:
+        return trace.shaped(
+            ready.structure, data, base, tried, run,
+            lambda share, text: report(0.95 + 0.04 * share, text),
+        )  # fmt: skip
+
     verdict, chosen, explanation = _judge(declared.significant, tried, base.chi2, data)
     if chosen is not None and chosen.spread is not None and len(chosen.effects) > 1:
         # a spread beside an effect takes up much: not where a law could do it that nobody knows
-        tried = trace.against_chance(tried, shaping.pieces(tried))
+        tried = trace.against_chance(tried, pieces())
         verdict, chosen, explanation = _judge(declared.significant, tried, base.chi2, data)
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
     where = None
     if verdict == "unexplained":
-        where = trace.whereabouts(shaping.pieces(tried), base)
+        where = trace.whereabouts(pieces(), base)
         explanation = f"{explanation} {where.words}"
     after = before if chosen is None else assess.assess(chosen.fit, data)
     before, after = _with_lock_in(before, after, data, run)
@@ -139,26 +147,6 @@ def diagnose(
         explanation=explanation,
         whereabouts=where,
     )
-
-
-@dataclass
-class _Shaping:
-    """Freely shaped pieces at each place of the loop, fitted once, when first asked for."""
-
-    structure: Structure
-    data: Dataset
-    base: Fit
-    run: Executor
-    report: Progress
-    found: list[Tried] | None = None
-
-    def pieces(self, tried: Sequence[Tried]) -> list[Tried]:
-        if self.found is None:
-            self.found = trace.shaped(
-                self.structure, self.data, self.base, tried, self.run,
-                lambda share, text: self.report(0.95 + 0.04 * share, text),
-            )  # fmt: skip
-        return self.found
 
 
 def _better(new: Fit, old: Fit) -> bool:

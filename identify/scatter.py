@@ -266,16 +266,15 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> st
     known = {
         "frequency": np.concatenate([r.batch.at.omega for r in kept]),
         "amplitude": np.concatenate([np.abs(r.batch.at.drive[:, 0]) for r in kept]),
-        "time": np.concatenate([r.batch.started_s for r in kept]),
     }
+    if scatter.location != "experiment":  # what wanders in the course of it may follow the time
+        known["time"] = np.concatenate([r.batch.started_s for r in kept])
     for j, q in enumerate(scatter.parameters):
         if sizes[j] < 10 * SMALLEST or np.ptp(x[:, j]) == 0:
             continue
         if np.max(x[:, j] ** 2) > ONE_RUN * np.sum(x[:, j] ** 2):
             return f"{q.name}: a single run deviates"
         for word, values in known.items():
-            if word == "time" and scatter.location == "experiment":
-                continue  # what wanders with time is what it says
             if np.ptp(values) > 0 and rank_correlation(x[:, j], values)[1] < TREND_P:
                 return f"{q.name} follows the {word}: no chance"
     return ""

@@ -158,6 +158,10 @@ class Effect:
         """Values at which the effect vanishes, where a score test can be taken; None: nowhere."""
         return None
 
+    def to_internal(self, values: Sequence[float]) -> FloatArray:
+        """Unknowns of the effect's own parameters from their physical values."""
+        return ParameterSet(self.parameters).to_internal(values)
+
     def restated(self, structure: "Structure") -> "Structure | None":
         """A richer structure without the effect that says the same, if there is one: its own
         starting values then serve too."""

@@ -7,6 +7,16 @@ from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
 
+def course(at: Conditions, change: Any, curvature: Any = None) -> Any:
+    """Factor on a parameter, one row a run: 1 at the campaign's start, 1 + change at its end, a
+    parabola in between where there is a curvature."""
+    t = at.time[:, None]
+    moved: Any = change * t
+    if curvature is not None:
+        moved = moved + curvature * (t * t - t)
+    return moved + 1.0
+
+
 class Drift(Effect):
     """A relative change over the campaign, linear in time (``_curve``: and quadratic).
 
@@ -36,11 +46,8 @@ class Drift(Effect):
         return (0.0,) * len(self.parameters)
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
-        t = at.time[:, None]
-        change: Any = p["parameter_drift.relative_change"] * t
-        if self.curved:
-            change = change + p["parameter_drift.curvature"] * (t * t - t)
-        factor = change + 1.0
+        curvature = p["parameter_drift.curvature"] if self.curved else None
+        factor = course(at, p["parameter_drift.relative_change"], curvature)
         if self.what == "frequency":
             return [replace(m, frequency_hz=m.frequency_hz * factor) for m in modes]
         if self.what == "first_mode":

@@ -13,15 +13,16 @@ from typing import Any
 import numpy as np
 
 from identify.effects.actuator import Distortion
-from identify.effects.forward import AcousticMode
+from identify.effects.experiment import course
+from identify.effects.forward import AcousticMode, NonlinearDamping
 from identify.effects.nonlinearity import HigherOrder
 from identify.effects.sensor import upper_pressure, with_leak
 from identify.parameters import Parameter
-from identify.polynomial import Polynomial
-from identify.structure import Conditions, Effect, Known, Loss, Mode, Values
+from identify.structure import Conditions, Effect, Known, Mode, Values
 
 STEPS = 4
 MODE = AcousticMode()
+LOSS = NonlinearDamping("cubic")
 DISTORTION = Distortion((2, 3))
 POWERS = HigherOrder((4, 5, 6, 7))
 WANDERING = ("frequency", "damping", "flame", "speaker")
@@ -46,8 +47,11 @@ class Shaped(Effect):
     def neutral(self) -> tuple[float, ...] | None:
         return (0.0,) * len(self.parameters)
 
+    def step(self, s: Any) -> Any:
+        return (self.corner - s) / (s + self.corner)
+
     def response(self, p: Values, s: Any) -> Any:
-        step = (self.corner - s) / (s + self.corner)
+        step = self.step(s)
         power, total = step, 1.0
         for j in range(1, STEPS + 1):
             total = total + (power - 1.0) * p[f"{self.name}.h{j}"]
@@ -83,7 +87,7 @@ class ShapedSensor(Shaped):
     besides = tuple(Parameter(f"shaped_sensor.pressure{j}", "1", scale=1e-3) for j in (0, 1, 2))
 
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
-        step = (self.corner - s) / (s + self.corner)
+        step = self.step(s)
         leak = upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
         shares: Sequence[Any] = [p[q.name] for q in self.besides]
         passed = shares[0] + step * shares[1] + step * step * shares[2]
@@ -97,7 +101,8 @@ class ShapedForward(Shaped):
     """
 
     location = "forward"
-    besides = (*MODE.parameters, Parameter("shaped_forward.loss", "s/m²"))
+    besides = (*MODE.parameters, *LOSS.parameters)
+    loss = LOSS.loss
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(*(0.0,) * STEPS, *row, 0.0) for row in MODE.starts(known)]
@@ -113,10 +118,6 @@ class ShapedForward(Shaped):
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         return MODE.modes(p, at, modes)
-
-    def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss:
-        beta = p["shaped_forward.loss"]
-        return Loss([beta] * len(modes), Polynomial((0.0, 0.0, 1.0)), [1.0] * len(modes))
 
 
 class ShapedNonlinearity(Shaped):
@@ -137,11 +138,10 @@ class ShapedExperiment(Shaped):
     )
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
-        t = at.time[:, None]
         f, z, r, a = (
-            p[f"shaped_experiment.{what}_change"] * t
-            + p[f"shaped_experiment.{what}_curvature"] * (t * t - t)
-            + 1.0
+            course(
+                at, p[f"shaped_experiment.{what}_change"], p[f"shaped_experiment.{what}_curvature"]
+            )
             for what in WANDERING
         )
         return [

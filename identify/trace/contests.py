@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+import numpy.typing as npt
 
 from identify.chances import chi2_tail
 from identify.dataset import Dataset
@@ -16,31 +17,47 @@ from identify.effects import CATALOGUE
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
-from identify.structure import Effect
+from identify.structure import Effect, Structure
 from identify.trace.stages import beside, known_sizes, louder, loudness, try_effects
-from identify.trace.tried import ALPHA, EVIDENCE, Tried, best_by_name, best_form, misfit, tried
+from identify.trace.tried import (
+    ALPHA,
+    EVIDENCE,
+    Tried,
+    best_by_name,
+    best_form,
+    key_of_forms,
+    misfit,
+    tried,
+)
 
+FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-UNSETTLED = 60.0  # the same for a fit that has not converged
+UNSETTLED = 60.0  # of χ² + p ln n: within that, what has not converged may yet be a rival
 REFORMED = 3  # sets of effects of which other forms are tried …
-NEARLY = 10.0  # … where they leave no more than so much χ²/dof
+NEAR = 10.0  # … where they leave no more than so much χ²/dof
 
 
 def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     """The values of `t` with some of its effects, not fitted again: as loud as with all."""
-    structure, values = replace(t.fit.structure, effects=effects), t.fit.values
-    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
-    left = [e for e in t.effects if e not in effects]
-    theta = louder(theta, structure.parameters.names, loudness(data, left, values))
+    structure, theta = _left(t, effects)
+    gone = [e for e in t.effects if e not in effects]
+    theta = louder(theta, structure.parameters.names, loudness(data, gone, t.fit.values))
     return replace(t.fit, structure=structure, theta=theta)
 
 
 def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     """The fit with only some of the effects of `t`, started from its values."""
-    smaller, values = replace(t.fit.structure, effects=effects), t.fit.values
-    theta = smaller.parameters.to_internal([values[n] for n in smaller.parameters.names])
+    smaller, theta = _left(t, effects)
     return fit_orbits(smaller, data, theta, continuation=(0.003, 0.0))
+
+
+def _left(t: Tried, effects: tuple[Effect, ...]) -> tuple[Structure, FloatArray]:
+    """The structure with only some of the effects of `t`, and its unknowns as they are there."""
+    structure, values = replace(t.fit.structure, effects=effects), t.fit.values
+    return structure, structure.parameters.to_internal(
+        [values[n] for n in structure.parameters.names]
+    )
 
 
 def eliminate(candidate: Tried, data: Dataset) -> Tried:
@@ -79,25 +96,21 @@ def in_other_forms(
     for e in best.effects:
         kept = tuple(o for o in best.effects if o is not e)
         for form in available:
-            forms = tuple(sorted(o.key for o in (*kept, form)))
-            if form.name == e.name and forms not in done:
-                items.append((best, e, form, data))
+            if form.name == e.name and key_of_forms((*kept, form)) not in done:
+                items.append((best, kept, e, form, data))
     fits = run.map(_in_form, items)
     return [tried(f.structure.effects, f, data) for f in fits if f and np.isfinite(f.chi2)]
 
 
-def _in_form(item: tuple[Tried, Effect, Effect, Dataset]) -> Fit | None:
-    """`t` with one of its effects in another form; None where it starts nowhere."""
-    t, old, form, data = item
-    base = part_of(t, tuple(o for o in t.effects if o is not old), data)
+def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) -> Fit | None:
+    """`t` with one of its effects in another form beside those kept; None where none starts."""
+    t, kept, old, form, data = item
+    base = part_of(t, kept, data)
     rows = form.starts(known_sizes(data, t.fit))
     if [q.unit for q in form.parameters] == [q.unit for q in old.parameters]:
         rows = [*rows, tuple(t.fit.values[q.name] for q in old.parameters)]
     thetas = [
-        np.r_[
-            beside(base.structure, base.theta, data, form, row),
-            [q.to_internal(v) for q, v in zip(form.parameters, row, strict=True)],
-        ]
+        np.r_[beside(base.structure, base.theta, data, form, row), form.to_internal(row)]
         for row in rows
     ]
     larger = base.structure.with_effects(form)
@@ -120,7 +133,7 @@ def reformed(
     Those in `done` (keys of forms) have had theirs; what is seen to here joins them.
     """
     out: list[Tried] = []
-    near = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEARLY]
+    near = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEAR]
     for t in near[:REFORMED]:
         current = t
         for _ in t.effects:
@@ -156,18 +169,18 @@ def in_their_places(
     best = best_form(good)
     if len(best.effects) == 1:
         return []
+    already = {e.key for e in best.effects}
     out: list[Tried] = []
     for kept in [*combinations(best.effects, len(best.effects) - 1), ()]:
-        if kept and tuple(sorted(e.key for e in kept)) in extended:
+        if kept and key_of_forms(kept) in extended:
             continue
         base = with_fewer(best, kept, data) if kept else part_of(best, (), data)
         if not np.isfinite(base.chi2):
             continue
         names = {e.name for e in kept}
-        tried_already = {e.key for e in best.effects}
         out += try_effects(
             base.structure, data, base,
-            [a for a in available if a.name not in names and a.key not in tried_already],
+            [a for a in available if a.name not in names and a.key not in already],
             executor=run, keep=5, far=False, scores=None if kept else {},
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
@@ -197,8 +210,7 @@ def _to_the_end(item: tuple[Tried, Dataset]) -> Fit:
     t, data = item
     last = t.effects[-1]
     others = t.fit.theta[: -len(last.parameters)]
-    rows = last.starts(known_sizes(data, t.fit))
-    inner = [[q.to_internal(v) for q, v in zip(last.parameters, r, strict=True)] for r in rows]
+    inner = [last.to_internal(row) for row in last.starts(known_sizes(data, t.fit))]
     again = [s.theta for s in coarse(t.fit.structure, data, [np.r_[others, r] for r in inner])]
     thetas = np.stack([t.fit.theta, *again[:3]])
     return fit_orbits(t.fit.structure, data, thetas, continuation=(0.003, 0.0), iterations=200)

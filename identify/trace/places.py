@@ -83,8 +83,7 @@ def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit | None:
     piece = structure.effects[0]
     fits = []
     for base in bases:
-        rows = piece.starts(known_sizes(data, base))
-        inner = [[q.to_internal(v) for q, v in zip(piece.parameters, r, strict=True)] for r in rows]
+        inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
         first, *others = shares_of(base, data)
         starts = coarse(structure, data, [np.r_[base.theta, row] for row in inner], first)[:STARTS]
         if starts:

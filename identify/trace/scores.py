@@ -45,7 +45,7 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     if neutral is None:
         return None
     larger = structure.with_effects(effect)
-    inner = [q.to_internal(v) for q, v in zip(effect.parameters, neutral, strict=True)]
+    inner = effect.to_internal(neutral)
     outcome = OrbitResidual(larger, data.fit)(np.r_[fit.theta, inner][None], np.array([0]), True)
     if outcome.jacobian is None or not outcome.exists[0]:
         return None

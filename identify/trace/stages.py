@@ -117,16 +117,14 @@ def beside(
 def _first_stage(task: _Task) -> list[CoarseStart]:
     """The best starts of one effect near the base fit at the first share of noise, best first."""
     larger = task.structure.with_effects(task.effect)
-    own = task.effect.parameters
-    inner = [[q.to_internal(v) for q, v in zip(own, row, strict=True)] for row in task.proposals]
+    inner = [task.effect.to_internal(row) for row in task.proposals]
     thetas = [
         np.r_[beside(task.structure, task.base.theta, task.data, task.effect, values), row]
         for values, row in zip(task.proposals, inner, strict=True)
     ]
     neutral = task.effect.neutral()
     if neutral is not None:  # never worse than without the effect
-        still = [q.to_internal(v) for q, v in zip(own, neutral, strict=True)]
-        thetas.append(np.r_[task.base.theta, still])
+        thetas.append(np.r_[task.base.theta, task.effect.to_internal(neutral)])
     if task.score is not None:
         bound = 20 * np.max(np.abs(inner), axis=0) + 1e-12
         thetas.append(np.r_[task.base.theta, np.clip(task.score.size, -bound, bound)])

@@ -44,7 +44,7 @@ class Tried:
 
     @property
     def key_of_forms(self) -> tuple[str, ...]:
-        return tuple(sorted(e.key for e in self.effects))
+        return key_of_forms(self.effects)
 
     @property
     def adequate(self) -> bool:
@@ -77,6 +77,11 @@ class Tried:
         return inside and all(
             values[f"mode{i}.damping"] < 0.7 for i in range(1, self.fit.structure.mode_count + 1)
         )
+
+
+def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
+    """What a set of effects in their forms goes by, in whatever order they stand."""
+    return tuple(sorted(e.key for e in effects))
 
 
 def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
