@@ -167,10 +167,8 @@ def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            missing = (
-                {t["effect"] for t in record["truth"]} if mode.startswith("leftout") else set()
-            )
-            left = [e for e in CANDIDATES if e.name not in missing]
+            gone = {t["effect"] for t in record["truth"]} if mode.startswith("leftout") else set()
+            left = [e for e in CANDIDATES if not gone & {e.name, *e.generalises}]
             d = identify.diagnose(campaign, catalogue=left)
     except Exception as error:
         return {**record, "error": f"{type(error).__name__}: {error}"}
