@@ -187,6 +187,7 @@ def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
         "dof": d.before.dof,
         "p": d.residual.p_value,
         "validation": [d.before.validation_error, d.after.validation_error, d.noise_floor],
+        "expected": d.after.expected_error,
         "quality": sorted({f"{q.flag}:{q.severity}" for q in d.quality}),
     }  # fmt: skip
     return record
@@ -242,14 +243,16 @@ def intervals(used: list[dict[str, Any]]) -> None:
         for key in sorted({k for k, _ in found}):
             z = [z for k, z in found if k == key]
             print(f"    {key:55s} {sum(abs(q) < 1.96 for q in z)} of {len(z)}")
-    left = [
-        r["validation"][1] / r["validation"][2]
-        for r in used
-        if r["verdict"] == "traced" and r["validation"][2]
-    ]
-    if left:
-        print(f"validation error after / noise floor, traced: median {np.median(left):.2f}, "
-              f"95 % below {np.quantile(left, 0.95):.2f}")  # fmt: skip
+    traced = [r for r in used if r["verdict"] == "traced" and r["validation"][2]]
+    for what, least in (
+        ("the noise floor", [r["validation"][2] for r in traced]),
+        ("what noise and parameters let expect", [r["expected"] for r in traced]),
+    ):
+        left = [r["validation"][1] / x for r, x in zip(traced, least, strict=True)]
+        if left:
+            print(f"validation error after over {what}, traced: median {np.median(left):.2f}, "
+                  f"95 % below {np.quantile(left, 0.95):.2f}, "
+                  f"above 1.5 in {sum(x > 1.5 for x in left)} of {len(left)}")  # fmt: skip
 
 
 def report(records: list[dict[str, Any]]) -> None:

@@ -85,6 +85,7 @@ def _mat(a: Assessment) -> dict[str, Any]:
         "fit_error": a.fit_error,
         "validation_error": a.validation_error,
         "noise_floor": a.noise_floor,
+        "expected_error": a.expected_error,
         "chi2_per_dof": a.chi2_per_dof,
         "dof": float(a.dof),
         "runs": _runs(a),

@@ -130,12 +130,27 @@ class Assessment:
     def parameters(self) -> dict[str, Estimate]:
         return self.fit.estimates
 
+    @property
+    def expected_error(self) -> float:
+        """The validation error that noise and the parameters' uncertainty together would cause,
+        √(Σ(E|noise|² + E|δŶ|²)/Σ|Y|²) over the validation runs: a model that is right stays near
+        it. NaN without validation runs or where the fit did not converge."""
+        held_out = [c for c in self.comparisons if c.role == "validation"]
+        variance = power = 0.0
+        for c in held_out:
+            if c.predicted_stderr is None:
+                return float("nan")
+            variance += float(np.sum(c.stderr**2 + c.predicted_stderr**2))
+            power += float(np.sum(np.abs(c.measured) ** 2))
+        return float(np.sqrt(variance / power)) if power > 0 else float("nan")
+
     def to_json(self) -> dict[str, Any]:
         return {
             "converged": self.fit.converged,
             "reason": self.fit.reason,
             "fit_error": number(self.fit_error),
             "validation_error": number(self.validation_error),
+            "expected_error": number(self.expected_error),
             "chi2_per_dof": number(self.chi2_per_dof),
             "dof": self.dof,
             "parameters": {n: e.to_json() for n, e in self.parameters.items()}

@@ -60,6 +60,9 @@ def test_validation_error_is_at_the_noise_floor(quiet: identify.Identification) 
     # one run, three harmonics and more: |error|² over noise is χ² with some ten degrees of freedom,
     # above four times its mean once in 10⁵
     assert a.validation_error < 2 * a.noise_floor
+    # the fitted runs' own uncertainty comes on top, here of the size of the noise
+    assert a.noise_floor < a.expected_error < 2 * a.noise_floor
+    assert a.to_json()["expected_error"] == a.expected_error
 
 
 def test_model_has_its_own_limit_cycle(quiet: identify.Identification) -> None:

@@ -156,7 +156,7 @@ def test_says_the_numbers_of_the_result(full: str) -> None:
     d = material.diagnosis()
     text = read(full).text
     for a in (d.before, d.after):
-        for error in (a.fit_error, a.validation_error, a.noise_floor):
+        for error in (a.fit_error, a.validation_error, a.noise_floor, a.expected_error):
             assert percent(error) in text
         assert scientific(a.chi2_per_dof) in text
         for e in a.parameters.values():

@@ -41,6 +41,7 @@ def error_rows(result: Result) -> list[list[str]]:
         ["fit error", *(percent(a.fit_error) for a in shown)],
         [f"validation error{crossed}", *(percent(a.validation_error) for a in shown)],
         ["noise floor", *(percent(a.noise_floor) for a in shown)],
+        ["noise and parameters' uncertainty", *(percent(a.expected_error) for a in shown)],
         ["validation error / noise floor", *(scientific(r) for r in ratio)],
         ["χ² per degree of freedom", *(scientific(a.chi2_per_dof) for a in shown)],
         ["degrees of freedom", *(str(a.dof) for a in shown)],
@@ -58,7 +59,8 @@ def errors(result: Result) -> str:
     numeric = range(1, len(heads) + 1)
     note = (
         "Relative errors of the velocity's Fourier coefficients, the model's own steady state "
-        "against the measured one. Noise floor: the validation error that noise alone would cause."
+        "against the measured one. Noise floor: the validation error that noise alone would cause; "
+        "below it, what noise and the uncertainty of the fitted parameters would cause together."
     )
     return table(["", *heads], error_rows(result), note, tuple(numeric))
 

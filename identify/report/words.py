@@ -162,8 +162,13 @@ def _forms(e: TracedEffect) -> str:
 def _misfit(subject: str, a: Assessment, p_value: float | None = None) -> str:
     p = "" if p_value is None else f", {p_is(p_value)}"
     ratio = a.validation_error / a.noise_floor if a.noise_floor > 0 else math.nan
+    expected = (
+        f"; with its parameters' uncertainty {percent(a.expected_error)} is to be expected"
+        if math.isfinite(a.expected_error)
+        else ""
+    )
     return (
         f"{subject} has χ²/dof = {scientific(a.chi2_per_dof)} at {a.dof} degrees of freedom{p}; "
         f"its validation error is {percent(a.validation_error)}, "
-        f"{scientific(ratio, 2)} times the noise floor of {percent(a.noise_floor)}."
+        f"{scientific(ratio, 2)} times the noise floor of {percent(a.noise_floor)}{expected}."
     )

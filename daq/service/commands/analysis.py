@@ -255,6 +255,11 @@ def show_diagnosis(found: "Diagnosis") -> None:
             ("fit error", number(before.fit_error, 3), number(after.fit_error, 3)),
             ("χ² per degree of freedom", number(before.chi2_per_dof), number(after.chi2_per_dof)),
             ("noise floor", number(found.noise_floor, 3), number(found.noise_floor, 3)),
+            (
+                "noise and parameters' uncertainty",
+                number(before.expected_error, 3),
+                number(after.expected_error, 3),
+            ),
         ),
     )
     if found.candidates:

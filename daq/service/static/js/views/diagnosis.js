@@ -39,7 +39,7 @@ export async function drawDiagnosis(job) {
     card("w5", "Verdict", h("p", { class: `verdict ${tone}`, id: "verdict", "data-verdict": d.verdict }, words),
       d.effects.map((e) => h("div", {}, h("h3", {}, `${e.effect} (${e.location})`), h("dl", {}, Object.entries(e.parameters).flatMap(([name, p]) => [h("dt", {}, name), h("dd", {}, `${plusMinus(p)} ${p.unit}`)])))),
       d.explanation ? h("p", {}, d.explanation) : "", reportLinks({ "HTML report": `/diagnoses/${job.id}/report`, JSON: `/diagnoses/${job.id}` })),
-    card("w7", "Error before and after", table("", ["", "before", "after"], [pair("validation error", "validation_error"), pair("fit error", "fit_error"), pair("χ² per degree of freedom", "chi2_per_dof", 4), ["noise floor", num(d.noise_floor, 3), num(d.noise_floor, 3)]], { numeric: [1, 2] }),
+    card("w7", "Error before and after", table("", ["", "before", "after"], [pair("validation error", "validation_error"), pair("fit error", "fit_error"), pair("χ² per degree of freedom", "chi2_per_dof", 4), ["noise floor", num(d.noise_floor, 3), num(d.noise_floor, 3)], pair("noise and parameters' uncertainty", "expected_error")], { numeric: [1, 2] }),
       h("p", { class: "soft" }, `Residual before: ${d.residual.significant ? "significant" : "within noise"}, p ${chance(d.residual.p_value).replace(/^(?!<)/, "= ")}. ${num(d.seconds, 3)} s.`)),
     card("w6", "Residual before", heat("Measured less modelled by harmonic, in standard errors", detail.before)),
     card("w6", "Residual after", heat("Measured less modelled by harmonic, in standard errors", detail.after)),
