@@ -27,17 +27,21 @@ FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 
+def noise_misfit(dof: int) -> float:
+    """The weighted sum of squares that noise alone leaves on average."""
+    return dof * VARIANCE_DOF / (VARIANCE_DOF - 2)
+
+
 def lack_of_fit_p(sum_of_squares: float, dof: int) -> float:
     """Probability that noise alone leaves at least this weighted sum of squares."""
     if dof < 1:
         return float("nan")
     if not np.isfinite(sum_of_squares):
         return 0.0
-    nu = VARIANCE_DOF
-    mean = nu / (nu - 2)
-    variance = nu**3 / ((nu - 2) ** 2 * (nu - 4))
+    nu, mean = VARIANCE_DOF, noise_misfit(dof)
+    variance = dof * nu**3 / ((nu - 2) ** 2 * (nu - 4))
     scale = variance / mean
-    return chi2_tail(sum_of_squares / scale, dof * mean**2 / variance)
+    return chi2_tail(sum_of_squares / scale, mean**2 / variance)
 
 
 @dataclass(frozen=True)

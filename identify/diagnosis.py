@@ -16,7 +16,7 @@ import numpy as np
 from identify import assess, design, drive, start, trace
 from identify.chances import rank_correlation
 from identify.dataset import Dataset
-from identify.effects import CANDIDATES, CATALOGUE
+from identify.effects import CANDIDATES
 from identify.executor import Executor, InProcess, one_thread
 from identify.fit import Fit
 from identify.identification import Prepared, prepare
@@ -115,11 +115,11 @@ def diagnose(
             lambda share, text: report(0.95 + 0.04 * share, text),
         )  # fmt: skip
 
-    verdict, chosen, explanation = _judge(declared.significant, tried, base.chi2, data)
+    verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
     if chosen is not None and chosen.spread is not None and len(chosen.effects) > 1:
         # a spread beside an effect takes up much: not where a law could do it that nobody knows
         tried = trace.against_chance(tried, pieces())
-        verdict, chosen, explanation = _judge(declared.significant, tried, base.chi2, data)
+        verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
@@ -138,7 +138,7 @@ def diagnose(
         quality=ready.quality.flags,
         before=before,
         residual=residual,
-        candidates=_candidates(tried, chosen, base.chi2, base.theta.size),
+        candidates=_candidates(tried, chosen, base),
         verdict=verdict,
         effects=effects,
         after=after,
@@ -245,12 +245,12 @@ def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float
 
 
 def _judge(
-    significant: bool, tried: Sequence[Tried], base_chi2: float, data: Dataset
+    significant: bool, tried: Sequence[Tried], base: Fit, data: Dataset
 ) -> tuple[Verdict, Tried | None, str]:
     """Verdict, the candidate it rests on, and the reason in words."""
     if not significant:
         return "no_discrepancy", None, "The declared model explains the data to within noise."
-    good = [t for t in tried if t.explains]
+    good = [t for t in tried if t.explains and trace.accounts(t, base)]
     if good:
         best = trace.best_form(good)
         others = trace.rivals(best, trace.best_by_name(good))
@@ -267,7 +267,7 @@ def _judge(
         names = ", ".join(" + ".join(t.names) for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."
     ranked = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)
-    near = _nearly(ranked, base_chi2, data)
+    near = _nearly(ranked, base.chi2, data)
     if near is not None:
         words = " + ".join(near.names)
         return "traced", near, (
@@ -279,7 +279,11 @@ def _judge(
         f" The best, {' + '.join(chosen.names)}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
         "it is reported, not claimed."
     )  # fmt: skip
-    return "unexplained", chosen, "No known effect explains the data to within noise." + left
+    if any(t.explains for t in tried):
+        said = "The misfit is small, and no known effect takes away enough of it to be its cause."
+    else:
+        said = "No known effect explains the data to within noise."
+    return "unexplained", chosen, said + left
 
 
 def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried | None:
@@ -306,9 +310,7 @@ def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried |
     return None
 
 
-def _candidates(
-    tried: Sequence[Tried], chosen: Tried | None, base_chi2: float, base_parameters: int
-) -> tuple[Candidate, ...]:
+def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:
     ordered = trace.best_by_name(tried)
     if chosen is not None:  # what the verdict rests on stands first
         ordered = [chosen, *(t for t in ordered if t.key != chosen.key)]
@@ -317,7 +319,7 @@ def _candidates(
     for t in ordered[:SHOWN]:
         alike = [o for o in good if t.explains and o is not t and _alike(t, o, chosen)]
         equal = [" + ".join(o.names) for o in alike]
-        out.append(trace.candidate(t, base_chi2, base_parameters, len(CATALOGUE), equal))
+        out.append(trace.candidate(t, base, equal))
     return tuple(out)
 
 

@@ -4,7 +4,7 @@ A search grows sets one effect at a time and drops what falls behind. Before one
 claimed, what might do as well from where it ended is tried.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -106,19 +106,34 @@ def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) ->
     """`t` with one of its effects in another form beside those kept; None where none starts."""
     t, kept, old, form, data = item
     base = part_of(t, kept, data)
-    rows = form.starts(known_sizes(data, t.fit))
-    if [q.unit for q in form.parameters] == [q.unit for q in old.parameters]:
-        rows = [*rows, tuple(t.fit.values[q.name] for q in old.parameters)]
-    thetas = [
-        np.r_[beside(base.structure, base.theta, data, form, row), form.to_internal(row)]
-        for row in rows
-    ]
     larger = base.structure.with_effects(form)
-    starts = coarse(larger, data, thetas)[:2]
-    if not starts:
-        return None
-    first = np.stack([s.theta for s in starts])
-    return fit_orbits(larger, data, first, continuation=(0.003, 0.0), iterations=30)
+
+    def start(row: Sequence[float]) -> FloatArray:
+        others = beside(base.structure, base.theta, data, form, row)
+        return np.concatenate([others, form.to_internal(row)])
+
+    rows = form.starts(known_sizes(data, t.fit))
+    taken = [_taken_over(row, form, old, t.fit.values) for row in rows[:1]]
+    starts = coarse(larger, data, [start(row) for row in (*rows, *taken)])[:2]
+    fits = []
+    if starts:
+        first = np.stack([s.theta for s in starts])
+        fits.append(fit_orbits(larger, data, first, continuation=(0.003, 0.0), iterations=30))
+    for row in taken:  # what `t` knows to within the noise, coarse noise would lose
+        fits.append(fit_orbits(larger, data, start(row), continuation=(0.0,), iterations=30))
+    return min(fits, key=lambda f: f.chi2, default=None)
+
+
+def _taken_over(
+    row: Sequence[float], form: Effect, old: Effect, values: Mapping[str, float]
+) -> tuple[float, ...]:
+    """Starting values of a form, those of the other form of the same units in their place."""
+    known = [(q.unit, values[q.name]) for q in old.parameters]
+    out = []
+    for q, value in zip(form.parameters, row, strict=True):
+        at = next((i for i, (unit, _) in enumerate(known) if unit == q.unit), None)
+        out.append(value if at is None else known.pop(at)[1])
+    return tuple(out)
 
 
 def reformed(

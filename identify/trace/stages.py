@@ -3,10 +3,11 @@
 The first stages run at noise of the misfit's own size: from the base fit (one Gauss–Newton step
 along the effect's tangent, projected off what the fit absorbs), and, where no effect stands out
 from there, from the slow flow corrected for the effect, because a gross effect drags the declared
-fit far away.
+fit far away. Where the tangent alone promises most of the misfit, the fit goes there directly too:
+beside a gross effect that is known exactly, coarse noise would lose what the base fit knows.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,6 +35,7 @@ FloatArray = npt.NDArray[np.float64]
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
 SURELY = 4  # so many are refitted in any case
+PROMISED = 0.5  # share of χ² that a small effect would take away: refitted straight from the base
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 FINE = 0.015  # share of noise below which all harmonics are looked at
 
@@ -167,6 +169,28 @@ def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     return _canonical(fit, task.data)
 
 
+def _promising(tasks: Sequence[_Task], keep: int) -> list[_Task]:
+    """Those whose score test promises most of the misfit, no more than two forms of an effect."""
+    out: list[_Task] = []
+    found = [(t.score.drop, t) for t in tasks if t.score is not None and t.base.converged]
+    for drop, task in sorted(found, key=lambda item: -item[0]):
+        same = sum(o.effect.name == task.effect.name for o in out)
+        if drop > PROMISED * task.base.chi2 and same < 2:
+            out.append(task)
+    return out[:keep]
+
+
+def _straight(task: _Task) -> Fit:
+    """From the base fit at the data's own noise: without the effect, and of the promised size."""
+    larger = task.structure.with_effects(task.effect)
+    neutral = task.effect.neutral()
+    assert neutral is not None  # else it had no score test
+    assert task.score is not None
+    inner = (task.effect.to_internal(neutral), task.score.size)
+    thetas = np.stack([np.r_[task.base.theta, row] for row in inner])
+    return _canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
+
+
 def _canonical(fit: Fit, data: Dataset) -> Fit:
     """The same fit with its effects' parameters named by the effects' own rules."""
     structure = fit.structure
@@ -249,27 +273,31 @@ def try_effects(
     def refit(
         chosen: Sequence[tuple[_Task, list[CoarseStart]]], first: float, last: float
     ) -> list[Tried]:
-        out = []
+        fits = []
         for i, fit in enumerate(executor.map(_second_stage, chosen), start=1):
-            effect = chosen[i - 1][0].effect
-            progress(first + i / len(chosen) * (last - first), f"refitting with {effect.key}")
-            if np.isfinite(fit.chi2):
-                out.append(tried((*structure.effects, effect), fit, data))
-        return out
+            fits.append(fit)
+            key = chosen[i - 1][0].effect.key
+            progress(first + i / len(chosen) * (last - first), f"refitting with {key}")
+        return finite(fits)
+
+    def finite(fits: Iterable[Fit]) -> list[Tried]:
+        return [tried(f.structure.effects, f, data) for f in fits if np.isfinite(f.chi2)]
 
     # two forms of an effect at the most, so that other effects get their turn: first those within
     # reach of the best …
-    chosen = _best(refined, keep, forms=2)
+    out = finite(executor.map(_straight, _promising(tasks, keep)))
+    there = {t.effects[-1].key for t in out if t.adequate}
+    chosen = [item for item in _best(refined, keep, forms=2) if item[0].effect.key not in there]
     costs = [starts[0].cost for _, starts in chosen]  # ascending
     near = max(SURELY, sum(cost <= REACH * costs[0] for cost in costs))
-    out = refit(chosen[:near], 0.7, 0.85)
+    out += refit(chosen[:near], 0.7, 0.85)
     if not any(t.explains for t in out):
         out += refit(chosen[near:], 0.85, 0.95)
     # … and then all forms of the best two: at coarse noise they could not be told apart
     if not any(t.explains for t in out):
         poor = [t for t in sorted(out, key=misfit) if not t.adequate]
         names = list(dict.fromkeys(t.effects[-1].name for t in poor))[:2]
-        done = {task.effect.key for task, _ in chosen}
+        done = {task.effect.key for task, _ in chosen} | there
         reached = {t.effect.key: s for t, s in refined if s}
         rest = [
             (t, reached.get(t.effect.key, s[:2]))

@@ -12,6 +12,7 @@ import numpy as np
 from identify import assess
 from identify.chances import chi2_tail
 from identify.dataset import Dataset
+from identify.effects import CATALOGUE
 from identify.fit import Fit
 from identify.parameters import Estimate
 from identify.results import Candidate
@@ -156,12 +157,24 @@ def _extends(t: Tried, best: Tried) -> bool:
     return t.fit.theta.size > best.fit.theta.size and set(best.names) <= set(t.names) | general
 
 
-def candidate(
-    t: Tried, smaller_chi2: float, smaller_p: int, tests: int, equal: Sequence[str]
-) -> Candidate:
+def gain_p(t: Tried, declared: Fit) -> float:
+    """Likelihood ratio of `t` against the declared model, corrected for the effects asked."""
+    freedom = max(t.fit.theta.size - declared.theta.size, 1)
+    return min(1.0, chi2_tail(declared.chi2 - t.fit.chi2, freedom) * len(CATALOGUE))
+
+
+def accounts(t: Tried, declared: Fit) -> bool:
+    """Whether the declared model's misfit goes with the effects: more than chance takes away, and
+    most of what exceeds the noise. What takes a part of little may leave the cause behind, under
+    the threshold. A spread has its own penalty."""
+    if t.spread is not None:
+        return True
+    excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (declared, t.fit))
+    return gain_p(t, declared) < ALPHA and left < excess / 2
+
+
+def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
     """The candidate's line of the report: its gain over the declared model, corrected."""
-    freedom = max(t.fit.theta.size - smaller_p, 1)
-    raw = chi2_tail(smaller_chi2 - t.fit.chi2, freedom)
     own = {q.name for e in t.effects for q in e.parameters}
     return Candidate(
         effects=t.names,
@@ -170,7 +183,7 @@ def candidate(
         chi2=t.fit.chi2,
         chi2_per_dof=t.fit.chi2_per_dof,
         validation_error=t.validation_error,
-        p_value=min(1.0, raw * tests),
+        p_value=gain_p(t, declared),
         parameters={n: e for n, e in t.estimates.items() if n in own},
         equivalent_to=tuple(equal),
         plausible=t.plausible,
