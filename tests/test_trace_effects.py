@@ -19,6 +19,7 @@ from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import fit_scatter
+from identify.structure import Structure
 from identify.trace.places import shaped, whereabouts
 from identify.trace.selection import against_chance, try_scatters
 from identify.trace.stages import known_sizes
@@ -310,6 +311,62 @@ def test_which_mode_is_the_further_one_is_named_by_rule_beside_another_effect(
     best, _ = search_for(ready, "acoustic_mode", "flame_delay")
     assert best.key == ("acoustic_mode", "flame_delay")
     assert best.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(345.0, abs=1.0)
+
+
+def test_a_small_effect_is_found_beside_a_gross_one(tmp_path: Path) -> None:
+    """A compressing speaker beside a microphone that lags 18 µs: coarse noise, at which effects are
+    tried first, loses what the fit with the lag knows; the tangent promises nearly all the rest."""
+    effects = {
+        "actuator_nonlinearity/compression": {"cubic_per_v2": 0.0025},
+        "channel_mismatch/lowpass": {"lowpass_hz": 9000.0},
+    }
+    ready = thesis_campaign(tmp_path, 79, effects, noise_db=43.0)
+    first = only(ready, start.fit_from_data(ready.structure, ready.data), "channel_mismatch:skew")
+    assert not first.adequate
+    structure = first.fit.structure
+    others = [e for e in CATALOGUE if trace.usable(e, ready.data, structure)]
+    others = [e for e in others if e.name not in (*first.names, "sensor_offset")]
+    found = trace.try_effects(
+        structure, ready.data, first.fit, others, executor=InProcess(), keep=5,
+        far=False, progress=lambda share, text: None,
+    )  # fmt: skip
+    assert found[0].effects[-1].name == "actuator_nonlinearity"
+    assert found[0].fit.chi2 < 0.1 * first.fit.chi2
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "accounted"),
+    [
+        (1.7, 1.05, True),
+        (1.7, 1.45, False),  # the likelihood ratio is sure of it, but most of the misfit stays
+        (1.1, 1.05, False),  # nearly nothing is left, but nearly nothing was there
+        (1.7, 1.69, False),
+        (np.inf, 1.05, True),
+    ],
+)
+def test_a_claim_takes_most_of_the_misfit_away(
+    before: float, after: float, accounted: bool
+) -> None:
+    """What is adequate because little was left to explain is not the cause for that."""
+
+    def fitted(parameters: int, chi2_per_dof: float) -> Fit:
+        dof, p = 119 - parameters, parameters
+        none = np.zeros((p, p))
+        return Fit(
+            Structure(2),
+            np.zeros(p),
+            dof * chi2_per_dof,
+            dof,
+            none,
+            np.zeros(119),
+            none,
+            True,
+            "",
+            1,
+        )
+
+    t = trace.Tried((by_key("flame_delay"),), fitted(11, after), 1e-3, 0.5, 0.5)
+    assert trace.accounts(t, fitted(10, before)) is accounted
 
 
 @pytest.mark.parametrize(

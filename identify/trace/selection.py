@@ -19,6 +19,7 @@ from identify.trace.tried import Tried, best_by_name, misfit, tried
 
 Progress = Callable[[float, str], None]
 
+SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
 
@@ -95,8 +96,11 @@ def search(
         if not any(t.explains for t in grown):
             report(0.6, "trying other forms of the best")
             grown += reformed(grown, data, available, run, done)
-        everything += [eliminate(t, data) for t in grown]
         level = best_by_name(grown)
+        # what leaves a misfit is no better for having less in it; the best are shown without
+        for t in grown:
+            shorten = t.adequate or any(t is best for best in level[:SHORTENED])
+            everything.append(eliminate(t, data) if shorten else t)
         if len(parents[0].effects) == 1 and not any(t.explains for t in everything):
             report(0.6, "trying run-to-run scatter beside an effect")
             for parent in parents:
