@@ -8,8 +8,9 @@
    are grown from the best singles, then triples; scatter beside an effect (`selection`). An effect
    stays only if leaving it out makes the fit significantly worse; other forms are tried, others in
    the place of each and of all, and what had not converged is led to the end (`contests`).
-4. What explains the data must also predict the validation runs, lie in its plausible range, and
-   have no rival: another effect that does as well, complexity counted (`tried`).
+4. What explains the data must also predict the validation runs, lie in its plausible range, take
+   most of the misfit away by more than chance, and have no rival: another effect that does as
+   well, complexity counted (`tried`).
 5. Where nothing explains the data, freely shaped pieces say where in the loop it lies
    (`places`).
 """
