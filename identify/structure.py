@@ -158,6 +158,11 @@ class Effect:
         """Values at which the effect vanishes, where a score test can be taken; None: nowhere."""
         return None
 
+    def shapes(self, known: "Known") -> list[tuple[float, ...]]:
+        """Values at which the effect vanishes whatever shape it would have: zero for its sizes,
+        which are tested at one shape after the other. None where `neutral` says it all."""
+        return []
+
     def to_internal(self, values: Sequence[float]) -> FloatArray:
         """Unknowns of the effect's own parameters from their physical values."""
         return ParameterSet(self.parameters).to_internal(values)

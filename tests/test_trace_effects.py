@@ -21,6 +21,7 @@ from identify.results import PLACES
 from identify.scatter import fit_scatter
 from identify.structure import Structure
 from identify.trace.places import shaped, whereabouts
+from identify.trace.scores import scan
 from identify.trace.selection import against_chance, try_scatters
 from identify.trace.stages import known_sizes
 from simulated_rig import build_config
@@ -332,6 +333,22 @@ def test_a_small_effect_is_found_beside_a_gross_one(tmp_path: Path) -> None:
     )  # fmt: skip
     assert found[0].effects[-1].name == "actuator_nonlinearity"
     assert found[0].fit.chi2 < 0.1 * first.fit.chi2
+
+
+def test_a_mode_that_takes_little_part_is_found_by_its_tangents(tmp_path: Path) -> None:
+    """Where a further mode lies is unknown while its residues are zero: each frequency is asked."""
+    side = {"frequency_hz": 231.0, "damping": 0.04, "coupling": 0.02}
+    ready = thesis_campaign(tmp_path, 5, {"side_resonator": side}, noise_db=60.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    effect = by_key("acoustic_mode")
+    shapes = effect.shapes(known_sizes(ready.data, base))
+    found = scan(ready.structure, ready.data, base, effect, shapes)
+    drop, row = found[0]
+    assert drop > 0.8 * (base.chi2 - base.dof)  # nearly all that noise does not explain
+    assert np.exp(row[0]) == pytest.approx(231.0, rel=0.06)
+    others = [np.exp(r[0]) for _, r in found[1:]]
+    assert all(d <= drop for d, _ in found[1:])
+    assert np.ptp(others) > 100  # not all neighbours of the best
 
 
 @pytest.mark.parametrize(

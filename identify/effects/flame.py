@@ -56,6 +56,9 @@ class SecondTimeScale(Effect):
         period = 1 / known.free_hz
         return [(0.1, 0.05 * period), (0.1, 0.5 * period)]
 
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0, float(q) / known.free_hz) for q in np.geomspace(0.01, 2.0, 12)]
+
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         share, time = p["flame_dynamics.share"], p["flame_dynamics.time_s"]
         return 1.0 - share + share / (s * time + 1.0)

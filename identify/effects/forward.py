@@ -40,6 +40,10 @@ class AcousticMode(Effect):
         ratios = (0.55, 1.45, 1.85, 2.33, 2.75, 3.3)
         return [(q * known.free_hz, 0.04, 0.02 * r, 0.02 * a) for q in ratios]
 
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        frequencies = known.free_hz * np.geomspace(0.4, 4.0, 48)
+        return [(float(f), zeta, 0.0, 0.0) for f in frequencies for zeta in (0.012, 0.05)]
+
     def restated(self, structure: Structure) -> Structure | None:
         return replace(structure, mode_count=structure.mode_count + 1)
 

@@ -106,6 +106,9 @@ class SoftDeadZone(Effect):
         w = known.flame_input_amplitude
         return [(0.1, 0.2 * w), (0.1, 0.5 * w)]
 
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0, float(q) * known.flame_input_amplitude) for q in np.geomspace(0.05, 1.0, 8)]
+
     def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
         share, level = p["nonlinearity_shape.share"], p["nonlinearity_shape.level"]
         return lambda w: n(w) - dual.tanh(w / level) * (level * share)

@@ -1,7 +1,8 @@
 """Score tests: along which effects' tangents the declared fit's residual lies.
 
 A tangent is projected off those of the fitted parameters, so that what the fit can absorb is not
-counted as evidence.
+counted as evidence. An effect whose shape is unknown where its size is zero (the frequency of a
+mode that takes no part) is tested at one shape after the other: to start from, never as evidence.
 """
 
 from collections.abc import Sequence
@@ -50,8 +51,8 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     if outcome.jacobian is None or not outcome.exists[0]:
         return None
     rho, J = outcome.residual[0], outcome.jacobian[0]
-    base, tangent = J[:, : fit.theta.size], J[:, fit.theta.size :]
-    Q, _ = np.linalg.qr(base / (np.sqrt(np.sum(base**2, axis=0)) + 1e-300))
+    tangent = J[:, fit.theta.size :]
+    Q = _span(J[:, : fit.theta.size])
     rest = tangent - Q @ (Q.T @ tangent)
     norm = float(np.linalg.norm(tangent))
     if not norm > 0:
@@ -66,6 +67,40 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     step = -V[kept].T @ (along / S[kept])
     drop = float(along @ along)
     return ScoreTest(drop, step, share, chi2_tail(drop, basis.shape[1]), basis)
+
+
+def scan(
+    structure: Structure, data: Dataset, fit: Fit, effect: Effect, shapes: Sequence[Sequence[float]]
+) -> list[tuple[float, FloatArray]]:
+    """What a small effect of each shape (`Effect.shapes`) would take off χ², and its unknowns; the
+    best first, of neighbours within 8 % only the better."""
+    larger = structure.with_effects(effect)
+    rows = np.stack([effect.to_internal(shape) for shape in shapes])
+    sized = np.array([value == 0 for value in shapes[0]])
+    thetas = np.concatenate([np.tile(fit.theta, (len(rows), 1)), rows], axis=1)
+    outcome = OrbitResidual(larger, data.fit)(thetas, np.arange(len(rows)), True)
+    if outcome.jacobian is None or not outcome.exists.all():
+        return []
+    count = fit.theta.size
+    Q = _span(outcome.jacobian[0][:, :count])
+    rho = outcome.residual[0] - Q @ (Q.T @ outcome.residual[0])
+    found = []
+    for row, J in zip(rows, outcome.jacobian, strict=True):
+        tangent = J[:, count:][:, sized]
+        rest = tangent - Q @ (Q.T @ tangent)
+        size = np.linalg.lstsq(rest, -rho, rcond=None)[0]
+        row[sized] = size
+        found.append((float(rho @ rho - np.sum((rho + rest @ size) ** 2)), row))
+    out: list[tuple[float, FloatArray]] = []
+    for drop, row in sorted(found, key=lambda item: -item[0]):
+        if all(np.abs(row[~sized] - other[~sized]).max() > 0.08 for _, other in out):
+            out.append((drop, row))
+    return out
+
+
+def _span(base: FloatArray) -> FloatArray:
+    """An orthonormal basis of what the fitted parameters' tangents span."""
+    return np.linalg.qr(base / (np.sqrt(np.sum(base**2, axis=0)) + 1e-300))[0]
 
 
 def score_tests(

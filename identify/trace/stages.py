@@ -27,7 +27,7 @@ from identify.start import (
     polish,
 )
 from identify.structure import Effect, Known, Structure
-from identify.trace.scores import ScoreTest, score_tests
+from identify.trace.scores import ScoreTest, scan, score_tests
 from identify.trace.tried import Tried, best_by_name, misfit, tried
 
 FloatArray = npt.NDArray[np.float64]
@@ -35,7 +35,8 @@ FloatArray = npt.NDArray[np.float64]
 AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
 SURELY = 4  # so many are refitted in any case
-PROMISED = 0.5  # share of χ² that a small effect would take away: refitted straight from the base
+PROMISED = 0.4  # share of χ² that a small effect would take away: refitted straight from the base
+SHAPES = 4  # so many are started from of an effect whose shape is unknown
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 FINE = 0.015  # share of noise below which all harmonics are looked at
 
@@ -169,25 +170,37 @@ def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     return _canonical(fit, task.data)
 
 
-def _promising(tasks: Sequence[_Task], keep: int) -> list[_Task]:
-    """Those whose score test promises most of the misfit, no more than two forms of an effect."""
-    out: list[_Task] = []
-    found = [(t.score.drop, t) for t in tasks if t.score is not None and t.base.converged]
-    for drop, task in sorted(found, key=lambda item: -item[0]):
-        same = sum(o.effect.name == task.effect.name for o in out)
+def _promise(task: _Task) -> tuple[float, list[FloatArray]]:
+    """What a small effect would take off χ² by the base fit's tangents, and unknowns of the effect
+    to start from."""
+    neutral, shapes = task.effect.neutral(), task.effect.shapes(task.known)
+    if task.score is not None and neutral is not None:
+        return task.score.drop, [task.effect.to_internal(neutral), task.score.size]
+    if shapes:
+        found = scan(task.structure, task.data, task.base, task.effect, shapes)[:SHAPES]
+        return max((drop for drop, _ in found), default=0.0), [row for _, row in found]
+    return 0.0, []
+
+
+def _promising(
+    tasks: Sequence[_Task], executor: Executor, keep: int
+) -> list[tuple[_Task, list[FloatArray]]]:
+    """The effects that promise most of the misfit, no more than two forms of one."""
+    sure = [t for t in tasks if t.base.converged]
+    promised = zip(sure, executor.map(_promise, sure), strict=True)
+    out: list[tuple[_Task, list[FloatArray]]] = []
+    for task, (drop, rows) in sorted(promised, key=lambda item: -item[1][0]):
+        same = sum(o.effect.name == task.effect.name for o, _ in out)
         if drop > PROMISED * task.base.chi2 and same < 2:
-            out.append(task)
+            out.append((task, rows))
     return out[:keep]
 
 
-def _straight(task: _Task) -> Fit:
-    """From the base fit at the data's own noise: without the effect, and of the promised size."""
+def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
+    """From the base fit at the data's own noise."""
+    task, rows = item
     larger = task.structure.with_effects(task.effect)
-    neutral = task.effect.neutral()
-    assert neutral is not None  # else it had no score test
-    assert task.score is not None
-    inner = (task.effect.to_internal(neutral), task.score.size)
-    thetas = np.stack([np.r_[task.base.theta, row] for row in inner])
+    thetas = np.stack([np.r_[task.base.theta, row] for row in rows])
     return _canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
 
 
@@ -285,7 +298,7 @@ def try_effects(
 
     # two forms of an effect at the most, so that other effects get their turn: first those within
     # reach of the best …
-    out = finite(executor.map(_straight, _promising(tasks, keep)))
+    out = finite(executor.map(_straight, _promising(tasks, executor, keep)))
     there = {t.effects[-1].key for t in out if t.adequate}
     chosen = [item for item in _best(refined, keep, forms=2) if item[0].effect.key not in there]
     costs = [starts[0].cost for _, starts in chosen]  # ascending
