@@ -12,10 +12,17 @@ from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits
 from identify.scatter import fit_scatter
 from identify.structure import Effect, Structure
-from identify.trace.contests import eliminate, in_other_forms, in_their_places, reformed, settled
+from identify.trace.contests import (
+    eliminate,
+    in_other_forms,
+    in_their_places,
+    reformed,
+    settled,
+    with_fewer,
+)
 from identify.trace.scores import ScoreTest
 from identify.trace.stages import started_again, try_effects
-from identify.trace.tried import Tried, best_by_name, misfit, tried
+from identify.trace.tried import Tried, best_by_name, best_form, misfit, tried
 
 Progress = Callable[[float, str], None]
 
@@ -111,6 +118,7 @@ def search(
         certain = [t for t in everything if t.spread is None]
         everything += reformed(certain, data, available, run, done)
     everything += in_their_places(everything, data, available, run, extended, report)
+    everything += _beside_the_same_chance(everything, data, available, run, report)
     everything += settled(everything, data, run)
     everything = against_chance(everything)
     return Search(
@@ -144,6 +152,39 @@ def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
             fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.003, 0.0))
             if np.isfinite(fit.chi2):
                 out.append(tried(t.fit.structure.effects, fit, data))
+    return out
+
+
+def _beside_the_same_chance(
+    tries: Sequence[Tried],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    report: Progress,
+) -> list[Tried]:
+    """Other effects in the place of the one that explains the data with a spread beside it.
+
+    Only the nearest had a spread tried beside them; which those are, the scattered runs decided.
+    """
+    good = [t for t in tries if t.explains]
+    best = best_form(good) if good else None
+    if best is None or best.spread is None or len(best.effects) != 2:
+        return []
+    law, chance = best.effects
+    assert isinstance(chance, Scatter)
+    wide = best.spread.data
+    base = with_fewer(best, (), wide)
+    if not np.isfinite(base.chi2):
+        return []
+    others = [a for a in available if a.name != law.name and a.location != "experiment"]
+    found = try_effects(
+        base.structure, wide, base, others, executor=run, keep=5, far=False,
+        progress=lambda share, text: report(0.95 + 0.05 * share, text),
+    )  # fmt: skip
+    out: list[Tried] = []
+    for t in best_by_name(found):
+        if t.explains:
+            out += try_scatters(t.fit.structure, data, t.fit, [chance])
     return out
 
 
