@@ -127,7 +127,7 @@ def diagnose(
     if verdict == "unexplained":
         where = trace.whereabouts(pieces(), base)
         explanation = f"{explanation} {where.words}"
-    after = before if chosen is None else assess.assess(chosen.fit, data)
+    after = before if chosen is None else _after(chosen, data)
     before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
     effects = (*_traced(chosen, tried), *tones) if claimed and chosen else tuple(tones)
@@ -147,6 +147,15 @@ def diagnose(
         explanation=explanation,
         whereabouts=where,
     )
+
+
+def _after(chosen: Tried, data: Dataset) -> Assessment:
+    """The chosen model against the data; a spread from run to run counts with its coefficients'
+    noise, but not with the noise floor."""
+    if chosen.spread is None:
+        return assess.assess(chosen.fit, data)
+    wide = assess.assess(chosen.fit, chosen.spread.data)
+    return replace(wide, noise_floor=data.noise_floor(data.validation or data.fit))
 
 
 def _better(new: Fit, old: Fit) -> bool:

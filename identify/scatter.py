@@ -196,7 +196,13 @@ def _widen(rows: _Rows, sizes: FloatArray) -> Batch:
     L = np.linalg.cholesky(_spread(rows, sizes))
     W = np.linalg.solve(L, b.whitener)
     inverse = np.linalg.inv(W)
-    return replace(b, whitener=W, covariance=inverse @ inverse.transpose(0, 2, 1))
+    covariance = inverse @ inverse.transpose(0, 2, 1)
+    added = np.diagonal(covariance - b.covariance, axis1=1, axis2=2)
+    added = added.reshape(b.runs, 2, b.compared).copy()
+    if b.free:
+        added[:, 1, 0] = 0.0  # the frequency's place
+    noise = b.noise + np.maximum(added.sum(axis=1), 0.0)
+    return replace(b, whitener=W, covariance=covariance, noise=noise)
 
 
 def _deviance(rows: Sequence[_Rows], sizes: FloatArray) -> float:

@@ -90,6 +90,9 @@ def test_a_spread_from_run_to_run_is_told_by_its_direction(
     assert spread is not None
     assert spread.objection == ""
     assert assess.lack_of_fit_p(spread.fit.chi2, spread.fit.dof) > 1e-3
+    # held-out runs are scattered too: what error is to be expected of them says so
+    held_out = zip(spread.data.validation, ready.data.validation, strict=True)
+    assert all((wide.noise[:, 0] > 10 * plain.noise[:, 0]).all() for wide, plain in held_out)
     other = "flame_gain_modulation" if name == "drive_scatter" else "drive_scatter"
     mine = spread.fit.chi2 + spread.penalty
     assert mine + trace.EVIDENCE < deviance(ready, base, other)
