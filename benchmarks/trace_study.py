@@ -55,7 +55,11 @@ COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, int], float]]] =
         "frequency_hz": lambda t, n: t["resonance_hz"],
         "damping": lambda t, n: t["damping"],
     },
-    ("acoustic_mode", "", ""): {
+    ("acoustic_mode", "mode", ""): {
+        "frequency_hz": lambda t, n: t["frequency_hz"],
+        "damping": lambda t, n: t["damping"],
+    },
+    ("acoustic_mode", "side_resonator", "side_resonator"): {
         "frequency_hz": lambda t, n: t["frequency_hz"],
         "damping": lambda t, n: t["damping"],
     },
@@ -70,7 +74,7 @@ COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, int], float]]] =
     },
 }
 
-# Effects of the same physics under another name: a side resonator is one more mode of the tube.
+# Effects that are a form of another: a side resonator acts as one more mode of the tube.
 SAME = {"side_resonator": "acoustic_mode"}
 
 
@@ -158,7 +162,8 @@ def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
     except ValueError as error:
         return {**record, "skipped": str(error)}
     record["truth"] = [
-        {"effect": SAME.get(e.name, e.name), "variant": e.variant, "location": e.location,
+        {"variant": e.name if e.name in SAME else e.variant,
+         "effect": SAME.get(e.name, e.name), "location": e.location,
          "parameters": {k: v["value"] for k, v in e.parameters().items()}}
         for e in effects
     ]  # fmt: skip

@@ -88,7 +88,8 @@ def structure_of(content: Mapping[str, Any]) -> Structure:
                 f"nonlinearity.{key}={shape[key]!r} belongs to form = {owner!r}, not {form!r}: "
                 f"leave it out"
             )
-    elements = tuple(e for place in PLACES for e in _elements(place, tables[place]))
+    modes = _integer("modes", content.get("modes", 2), 1)
+    elements = tuple(e for place in PLACES for e in _elements(place, tables[place], modes))
     names = [p.name for e in elements for p in e.parameters]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:
@@ -96,7 +97,7 @@ def structure_of(content: Mapping[str, Any]) -> Structure:
             f"elements {[e.key for e in elements]} share parameters {twice}: declare one of them"
         )
     return Structure(
-        mode_count=_integer("modes", content.get("modes", 2), 1),
+        mode_count=modes,
         flame_order=_integer("flame.order", flame.get("order", 1), 0),
         flame_delay=_boolean("flame.delay", flame.get("delay", False)),
         nonlinearity=form,
@@ -140,9 +141,9 @@ def _table(content: Mapping[str, Any], place: str) -> Mapping[str, Any]:
     return table
 
 
-def _elements(place: str, table: Mapping[str, Any]) -> list[Effect]:
+def _elements(place: str, table: Mapping[str, Any], modes: int) -> list[Effect]:
     keys = table.get("elements", [])
-    here = [e for e in CATALOGUE if e.location == place]
+    here = [e for e in CATALOGUE if e.location == place and e.mode_count in (None, modes)]
     if not isinstance(keys, list):
         raise ValueError(f"{place}.elements={keys!r} is not a list of «name:form»")
     found = []

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.fit import Fit
-from identify.structure import Conditions, Mode, Structure
+from identify.structure import Conditions, Effect, Mode, Structure
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -99,6 +99,9 @@ def state_space(fit: Fit, part: Part = "forward", band_hz: float | None = None) 
     """
     if not fit.converged:
         raise ValueError(f"the fit did not converge ({fit.reason}); it has no state space")
+    for e in fit.structure.effects:
+        if part != "flame" and type(e).branch is not Effect.branch:
+            raise ValueError(f"effect {e.key}, a branch beside the tube, has no state space here")
     p = fit.values
     modes = _modes(fit.structure, p)
     top = band_hz if band_hz is not None else 4.0 * max(float(m.frequency_hz) for m in modes)

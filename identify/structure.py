@@ -134,6 +134,16 @@ class Loss:
     weights: Sequence[Any]
 
 
+@dataclass(frozen=True)
+class Branch:
+    """A linear load beside the tube: Z v pushes back on mode i by `returned`[i], where
+    v = Σ `felt`[i] · y_i is the velocity there and `impedance` is Z (1/s), (runs, harmonics)."""
+
+    impedance: Any
+    felt: Sequence[Any]
+    returned: Sequence[Any]
+
+
 class Effect:
     """Something that a declared model may lack: parameters, and changes to pieces of the loop.
 
@@ -149,10 +159,23 @@ class Effect:
     needs: tuple[str, ...] = ()  # what the campaign must hold, e.g. "pressure"
     generalises: tuple[str, ...] = ()  # effects of which this is an extension, not a rival
     mode_count: int | None = None  # only for declared models of that many modes
+    refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
 
     def starts(self, known: "Known") -> list[tuple[float, ...]]:
         raise NotImplementedError(f"effect {self.name!r} proposes no starting values")
+
+    def starts_from(self, other: "Effect", values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Starting values from those that another form of the same effect has come to (with the
+        declared model's): what has the same unit is taken over."""
+        known = [(q.unit, values[q.name]) for q in other.parameters]
+        row = []
+        for q in self.parameters:
+            at = next((i for i, (unit, _) in enumerate(known) if unit == q.unit), None)
+            if at is None:
+                return []
+            row.append(known.pop(at)[1])
+        return [tuple(row)]
 
     def neutral(self) -> tuple[float, ...] | None:
         """Values at which the effect vanishes, where a score test can be taken; None: nowhere."""
@@ -195,6 +218,9 @@ class Effect:
         return None
 
     def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss | None:
+        return None
+
+    def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch | None:
         return None
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
@@ -301,7 +327,7 @@ class Structure:
     def assemble(self, p: Values, at: Conditions, s: Any) -> Loop:
         """The loop's equations at the complex frequencies `s`, shape (runs, harmonics)."""
         modes = self._modes(p, at)
-        resonators = [_resonator(m, s) for m in modes]
+        resonators = [resonance(m, s) for m in modes]
         H = self.flame_path(p, at, s)
         drive: Any = at.drive
         for e in self.effects:
@@ -309,18 +335,18 @@ class Structure:
         for e in self.effects:
             drive = e.actuator(p, at, s) * drive
         on = at.flame_on[:, None]
-        at_flame = (
-            _sum(b * m.flame_residue for b, m in zip(resonators, modes, strict=True)) * s * on
+        by_flame = [m.flame_residue for m in modes]
+        by_drive = [m.speaker_residue for m in modes]
+        response = _responses(resonators, self._branch(p, modes, s))
+        at_flame, from_drive = (
+            response(resonators, by_flame) * s * on,
+            response(resonators, by_drive),
         )
-        from_drive = _sum(b * m.speaker_residue for b, m in zip(resonators, modes, strict=True))
         seen_flame, seen_drive = at_flame, from_drive
         if any(m.sensor_ratio is not None for m in modes):
             ratios = [1.0 if m.sensor_ratio is None else m.sensor_ratio for m in modes]
             seen = [b * q for b, q in zip(resonators, ratios, strict=True)]
-            seen_flame = (
-                _sum(b * m.flame_residue for b, m in zip(seen, modes, strict=True)) * s * on
-            )
-            seen_drive = _sum(b * m.speaker_residue for b, m in zip(seen, modes, strict=True))
+            seen_flame, seen_drive = response(seen, by_flame) * s * on, response(seen, by_drive)
 
         def sensor(y: Any) -> Any:
             for e in self.effects:
@@ -342,13 +368,10 @@ class Structure:
         if len(losses) > 1:
             raise ValueError("two effects declare an amplitude-dependent loss; one at most")
         loss = losses[0]
-        lossy = -_sum(b * c for b, c in zip(resonators, loss.coefficients, strict=True))
+        lossy = -response(resonators, loss.coefficients)
         felt = [b * w for b, w in zip(resonators, loss.weights, strict=True)]
-        row = (
-            _sum(b * m.flame_residue for b, m in zip(felt, modes, strict=True)) * s * on,
-            -_sum(b * c for b, c in zip(felt, loss.coefficients, strict=True)),
-        )
-        q_loss = _sum(b * m.speaker_residue for b, m in zip(felt, modes, strict=True)) * drive
+        row = (response(felt, by_flame) * s * on, -response(felt, loss.coefficients))
+        q_loss = response(felt, by_drive) * drive
         return Loop(
             ((H * at_flame, H * lossy), row),
             (H * (from_drive * drive), q_loss),
@@ -376,6 +399,12 @@ class Structure:
         for e in self.effects:
             modes = e.modes(p, at, modes)
         return modes
+
+    def _branch(self, p: Values, modes: list[Mode], s: Any) -> Branch | None:
+        found = [x for e in self.effects if (x := e.branch(p, modes, s)) is not None]
+        if len(found) > 1:
+            raise ValueError("two effects declare a branch beside the tube; one at most")
+        return found[0] if found else None
 
     def _losses(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Loss]:
         return [x for e in self.effects if (x := e.loss(p, at, modes)) is not None]
@@ -426,7 +455,7 @@ def _lagrange_coefficients(nodes: Sequence[float], values: Sequence[Any]) -> lis
     return [_sum(matrix[d, j] * excess[j] for j in range(x.size)) for d in range(x.size)]
 
 
-def _resonator(mode: Mode, s: Any) -> Any:
+def resonance(mode: Mode, s: Any) -> Any:
     """b = s/(s² + 2ζωs + ω²) with its partial derivatives by s, ω and ζ."""
     w = 2 * np.pi * mode.frequency_hz
     z = mode.damping
@@ -448,6 +477,27 @@ def _low_pass(top: Any, pole: Any, s: Any) -> Any:
     inverse = 1.0 / (dual.value(s) + dual.value(pole))
     unit = dual.chain(inverse, (-inverse * inverse, s), (-inverse * inverse, pole))
     return unit if top is None else unit * top
+
+
+def _responses(
+    resonators: Sequence[Any], branch: Branch | None
+) -> Callable[[Sequence[Any], Sequence[Any]], Any]:
+    """Σ_i o_i y_i as a function of the modes' responses with their outputs, b_i o_i, and of the
+    forces f_i on them: y_i = b_i (f_i − g_i Z Σ_j q_j y_j) with a branch of Z, q and g."""
+
+    def free(outputs: Sequence[Any], forces: Sequence[Any]) -> Any:
+        return _sum(b * f for b, f in zip(outputs, forces, strict=True))
+
+    if branch is None:
+        return free
+    felt = [b * q for b, q in zip(resonators, branch.felt, strict=True)]
+    returned = branch.returned
+    load = branch.impedance / (branch.impedance * free(felt, returned) + 1.0)
+
+    def loaded(outputs: Sequence[Any], forces: Sequence[Any]) -> Any:
+        return free(outputs, forces) - load * free(outputs, returned) * free(felt, forces)
+
+    return loaded
 
 
 def _sum(terms: Any) -> Any:

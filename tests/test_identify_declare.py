@@ -25,8 +25,10 @@ def test_a_bare_declaration_is_the_default_model() -> None:
 
 def test_every_element_can_be_declared_at_its_place() -> None:
     for effect in CATALOGUE:
-        found = structure_of({"format": "model/1", effect.location: {"elements": [effect.key]}})
-        assert [e.key for e in found.effects] == [effect.key]
+        modes = effect.mode_count or 2
+        table = {"elements": [effect.key]}
+        found = structure_of({"format": "model/1", "modes": modes, effect.location: table})
+        assert found.effects == (effect,)
         assert effect.key in described(found).options["elements"]
 
 

@@ -10,6 +10,7 @@ import identify
 from daq.importers import open_campaign
 from identify import assess, balance, start, trace
 from identify.effects import CATALOGUE, by_key
+from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import Fit
@@ -20,6 +21,7 @@ from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import fit_scatter
 from identify.structure import Structure
+from identify.trace.contests import in_other_forms
 from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import scan
 from identify.trace.selection import against_chance, try_scatters
@@ -354,6 +356,21 @@ def test_a_mode_that_takes_little_part_is_found_by_its_tangents(tmp_path: Path) 
     assert np.abs(np.log(frequencies[:4] / 231.0)).min() < 0.06  # … and the truth among them
     fit = only(ready, base, effect.key).fit
     assert fit.values["acoustic_mode.frequency_hz"] == pytest.approx(231.0, rel=0.03)
+
+
+def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
+    """Strongly coupled, it shifts the tube's own modes and turns the phases of their residues; it
+    is found from the further mode that comes nearest to it."""
+    side_branch = {"frequency_hz": 231.0, "damping": 0.04, "coupling": 0.05}
+    ready = thesis_campaign(tmp_path, 5, {"side_resonator": side_branch}, noise_db=66.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    mode, side = only(ready, base, "acoustic_mode:mode"), SideResonator(2)
+    assert not mode.explains
+    (found,) = in_other_forms([mode], ready.data, [side], InProcess())
+    excess = [f.chi2 - assess.noise_misfit(f.dof) for f in (mode.fit, found.fit)]
+    assert excess[1] < 0.4 * excess[0]
+    assert found.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(231.0, abs=3.0)
+    assert mode.fit.values["acoustic_mode.frequency_hz"] < 225.0
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 from identify.parameters import Parameter
 from identify.polynomial import Polynomial
 from identify.structure import (
+    Branch,
     Conditions,
     Effect,
     Known,
@@ -17,17 +18,17 @@ from identify.structure import (
     Mode,
     Structure,
     Values,
+    resonance,
 )
 
 
 class AcousticMode(Effect):
     """One more acoustic mode, of the same four parameters as the declared ones.
 
-    A side resonator or a plenum coupled to the tube appears as one more mode too: from one
-    velocity signal the two cannot be told apart.
+    A weakly coupled side resonator or plenum appears as one more mode too.
     """
 
-    name, location = "acoustic_mode", "forward"
+    name, location, form = "acoustic_mode", "forward", "mode"
     parameters = (
         Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
         Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
@@ -73,6 +74,63 @@ class AcousticMode(Effect):
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         names = (x.name for x in self.parameters)
         return [*modes, Mode(*(p[n] for n in names))]
+
+
+class SideResonator(Effect):
+    """A resonator beside the tube, a Helmholtz resonator or a plenum, coupled to `modes` modes.
+
+    y'' + 2ζω y' + ω² y = ω² Σ q_i η_i, with the displacements η_i at its mouth, and it pushes back
+    on mode i by −κ_i y''. So κ_i ω² s/(s² + 2ζωs + ω²) loads the velocity there; q_1 = 1.
+    Other than one more mode, it moves the poles of the others, and its residues have phases.
+    """
+
+    name, location, form = "acoustic_mode", "forward", "side_resonator"
+    refines = True
+
+    def __init__(self, modes: int) -> None:
+        self.mode_count = self.count = modes
+        each = range(1, modes + 1)
+        self.parameters = (
+            Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
+            Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
+            *(Parameter(f"acoustic_mode.coupling{i}", "1", -1.0, 1.0, scale=1e-3) for i in each),
+            *(Parameter(f"acoustic_mode.mouth_ratio{i}", "1", -20.0, 20.0) for i in each[1:]),
+        )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        ones = (1.0,) * (self.count - 1)
+        places = [q * known.free_hz for q in (0.8, 1.3, 1.9)]
+        return [(f, 0.04, *(3e-3,) * self.count, *ones) for f in places]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From one more mode: at its frequency the load takes the place of its residues, so that
+        r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise; κ_i is taken to go as q_i."""
+        if not isinstance(other, AcousticMode):
+            return []
+        f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
+        s = 2j * np.pi * f
+        names = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
+        modes = [Mode(*(values[f"mode{i}.{n}"] for n in names)) for i in range(1, self.count + 1)]
+        b = np.array([complex(resonance(m, s)) for m in modes])
+        r, a = (np.array([getattr(m, n) for m in modes]) for n in names[2:])
+        part = (b * (a * r_e - r * a_e)).imag  # Σ q_i part_i = 0
+        q = np.ones(self.count)
+        if self.count > 1 and np.all(part[1:] != 0):
+            q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
+        size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
+        row = (f, zeta, *(size.real * q).tolist(), *q[1:].tolist())
+        return [row] if np.isfinite(row).all() else []
+
+    def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
+        f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]
+        w = 2 * np.pi * f
+        values = [p[q.name] for q in self.parameters[2:]]
+        none = [0.0] * (len(modes) - self.count)  # modes of another effect
+        return Branch(
+            impedance=resonance(Mode(f, zeta, 0.0, 0.0), s) * (w * w),
+            felt=[1.0, *values[self.count :], *none],
+            returned=[*values[: self.count], *none],
+        )
 
 
 class NonlinearDamping(Effect):
@@ -125,6 +183,7 @@ class NonlinearDamping(Effect):
 
 EFFECTS: tuple[Effect, ...] = (
     AcousticMode(),
+    *(SideResonator(n) for n in (1, 2, 3)),
     NonlinearDamping("quadratic"),
     NonlinearDamping("quadratic_mode"),
     NonlinearDamping("cubic"),

@@ -10,6 +10,7 @@ from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import least_squares
 
 from identify.chances import chi2_tail
 from identify.dataset import Dataset
@@ -30,10 +31,13 @@ from identify.trace.tried import (
     tried,
 )
 
+ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
 UNSETTLED = 60.0  # of χ² + p ln n: within that, what has not converged may yet be a rival
+NEARBY = 0.7  # of the logarithm, where another form is matched
+REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
 REFORMED = 3  # sets of effects of which other forms are tried …
 NEAR = 10.0  # … where they leave no more than so much χ²/dof
 
@@ -96,6 +100,8 @@ def in_other_forms(
     for e in best.effects:
         kept = tuple(o for o in best.effects if o is not e)
         for form in available:
+            if form.refines and best.explains:
+                continue
             if form.name == e.name and key_of_forms((*kept, form)) not in done:
                 items.append((best, kept, e, form, data))
     fits = run.map(_in_form, items)
@@ -112,28 +118,63 @@ def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) ->
         others = beside(base.structure, base.theta, data, form, row)
         return np.concatenate([others, form.to_internal(row)])
 
-    rows = form.starts(known_sizes(data, t.fit))
-    taken = [_taken_over(row, form, old, t.fit.values) for row in rows[:1]]
-    starts = coarse(larger, data, [start(row) for row in (*rows, *taken)])[:2]
+    taken = [start(row) for row in form.starts_from(old, t.fit.values)]
+    if form.refines:
+        fits = [
+            fit_orbits(larger, data, theta, continuation=(0.003, 0.0), iterations=REFINED)
+            for row in taken
+            if (theta := matched(larger, row, t.fit, data)) is not None
+        ]
+        return min(fits, key=lambda f: f.chi2, default=None)
+    rows = [start(row) for row in form.starts(known_sizes(data, t.fit))]
+    starts = coarse(larger, data, [*rows, *taken])[:2]
     fits = []
     if starts:
         first = np.stack([s.theta for s in starts])
         fits.append(fit_orbits(larger, data, first, continuation=(0.003, 0.0), iterations=30))
-    for row in taken:  # what `t` knows to within the noise, coarse noise would lose
-        fits.append(fit_orbits(larger, data, start(row), continuation=(0.0,), iterations=30))
+    if taken:  # what `t` knows to within the noise, coarse noise would lose
+        fits.append(fit_orbits(larger, data, np.stack(taken), continuation=(0.0,), iterations=30))
     return min(fits, key=lambda f: f.chi2, default=None)
 
 
-def _taken_over(
-    row: Sequence[float], form: Effect, old: Effect, values: Mapping[str, float]
-) -> tuple[float, ...]:
-    """Starting values of a form, those of the other form of the same units in their place."""
-    known = [(q.unit, values[q.name]) for q in old.parameters]
-    out = []
-    for q, value in zip(form.parameters, row, strict=True):
-        at = next((i for i, (unit, _) in enumerate(known) if unit == q.unit), None)
-        out.append(value if at is None else known.pop(at)[1])
-    return tuple(out)
+def matched(larger: Structure, theta: FloatArray, fit: Fit, data: Dataset) -> FloatArray | None:
+    """Unknowns of `larger` with whose acoustics it responds as `fit` does at the measured
+    harmonics, from `theta`; None where they cannot be brought within a tenth."""
+    names = larger.parameters.names
+    own = {q.name for q in larger.effects[-1].parameters}
+    free = [i for i, n in enumerate(names) if n.startswith("mode") or n in own]
+
+    def responses(structure: Structure, values: Mapping[str, float]) -> ComplexArray:
+        parts = []
+        for b in data.fit:
+            at = replace(b.at, drive=np.ones_like(b.at.drive))
+            s = 1j * at.omega[:, None] * np.arange(1, at.drive.shape[1] + 1)
+            loop = structure.assemble(values, at, s)
+            parts += [np.broadcast_to(x, s.shape).ravel() for x in (loop.G[0], loop.G_u)]
+        return np.concatenate(parts)
+
+    target = responses(fit.structure, fit.values)
+    scale = np.where(target == 0, 1.0, target)  # of the flame in cold runs
+
+    def difference(x: FloatArray) -> FloatArray:
+        moved = theta.copy()
+        moved[free] = x
+        with np.errstate(all="ignore"):
+            rest = (responses(larger, larger.parameters.plain(moved)) - target) / scale
+        both = np.concatenate([rest.real, rest.imag])
+        return np.asarray(np.nan_to_num(both, nan=1e6, posinf=1e6, neginf=-1e6))
+
+    low, high = (np.asarray(limit)[free] for limit in larger.parameters.bounds())
+    near = np.array([larger.parameters.parameters[i].kind == "positive" for i in free])
+    low = np.where(near, np.maximum(low, theta[free] - NEARBY), low)
+    high = np.where(near, np.minimum(high, theta[free] + NEARBY), high)
+    begin = np.clip(theta[free], low + 1e-9, high - 1e-9)
+    found = least_squares(difference, begin, bounds=(low, high), x_scale="jac", max_nfev=150)
+    if not np.sqrt(np.mean(found.fun**2)) < 0.1:
+        return None
+    out = theta.copy()
+    out[free] = found.x
+    return out
 
 
 def reformed(

@@ -61,11 +61,12 @@ def search(
     report = progress or (lambda share, text: None)
     scatters = [e for e in catalogue if isinstance(e, Scatter)]
     available = [e for e in catalogue if usable(e, data, structure)]
+    apart = [e for e in available if not e.refines]
     singles = try_effects(
         structure,
         data,
         base,
-        available,
+        apart,
         executor=run,
         keep=8,
         far=base.chi2_per_dof > GROSS,
@@ -91,7 +92,7 @@ def search(
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
         for parent in parents:
             extended.add(parent.key_of_forms)
-            rest = [e for e in available if e.name not in parent.names]
+            rest = [e for e in apart if e.name not in parent.names]
             grown += try_effects(
                 parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,
                 progress=lambda share, text: report(0.6 + 0.35 * share, text),
@@ -117,8 +118,8 @@ def search(
     if not any(t.explains for t in everything):
         certain = [t for t in everything if t.spread is None]
         everything += reformed(certain, data, available, run, done)
-    everything += in_their_places(everything, data, available, run, extended, report)
-    everything += _beside_the_same_chance(everything, data, available, run, report)
+    everything += in_their_places(everything, data, apart, run, extended, report)
+    everything += _beside_the_same_chance(everything, data, apart, run, report)
     everything += settled(everything, data, run)
     everything = against_chance(everything)
     return Search(
