@@ -259,7 +259,7 @@ def _judge(
     """Verdict, the candidate it rests on, and the reason in words."""
     if not significant:
         return "no_discrepancy", None, "The declared model explains the data to within noise."
-    good = [t for t in tried if t.explains and trace.accounts(t, base)]
+    good = [t for t in tried if t.explains and trace.accounts(t, base, tried)]
     if good:
         best = trace.best_form(good)
         others = trace.rivals(best, trace.best_by_name(good))
@@ -289,7 +289,7 @@ def _judge(
         "it is reported, not claimed."
     )  # fmt: skip
     if any(t.explains for t in tried):
-        said = "The misfit is small, and no known effect takes away enough of it to be its cause."
+        said = "What comes near to the data takes too little of the misfit away to be its cause."
     else:
         said = "No known effect explains the data to within noise."
     return "unexplained", chosen, said + left

@@ -377,7 +377,7 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     ("before", "after", "accounted"),
     [
         (1.7, 1.05, True),
-        (1.7, 1.45, False),  # the likelihood ratio is sure of it, but most of the misfit stays
+        (1.7, 1.4, False),  # the likelihood ratio is sure of it, but most of the misfit stays
         (1.1, 1.05, False),  # nearly nothing is left, but nearly nothing was there
         (1.7, 1.69, False),
         (np.inf, 1.05, True),
@@ -386,7 +386,8 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
 def test_a_claim_takes_most_of_the_misfit_away(
     before: float, after: float, accounted: bool
 ) -> None:
-    """What is adequate because little was left to explain is not the cause for that."""
+    """What is adequate because little was left to explain is not the cause for that: neither of
+    the declared model's misfit nor, in a pair, of what the other effect leaves."""
 
     def fitted(parameters: int, chi2_per_dof: float) -> Fit:
         dof, p = 119 - parameters, parameters
@@ -404,8 +405,15 @@ def test_a_claim_takes_most_of_the_misfit_away(
             1,
         )
 
-    t = trace.Tried((by_key("flame_delay"),), fitted(11, after), 1e-3, 0.5, 0.5)
-    assert trace.accounts(t, fitted(10, before)) is accounted
+    def found(fit: Fit, *keys: str) -> trace.Tried:
+        return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)
+
+    delay = found(fitted(11, after), "flame_delay")
+    assert trace.accounts(delay, fitted(10, before), []) is accounted
+    gross = fitted(9, 1e4)
+    skew = found(fitted(10, before), "channel_mismatch:skew")
+    both = found(fitted(11, after), "channel_mismatch:skew", "flame_delay")
+    assert trace.accounts(both, gross, [skew, both]) is accounted
 
 
 @pytest.mark.parametrize(

@@ -109,9 +109,12 @@ def search(
         for t in grown:
             shorten = t.adequate or any(t is best for best in level[:SHORTENED])
             everything.append(eliminate(t, data) if shorten else t)
-        if len(parents[0].effects) == 1 and not any(t.explains for t in everything):
+        if len(parents[0].effects) == 1:
             report(0.6, "trying run-to-run scatter beside an effect")
+            good = [t for t in everything if t.explains]
             for parent in parents:
+                if good and parent.names[0] not in best_form(good).names:
+                    continue  # no rival: what explains the data does so without it
                 if parent.effects[0].location != "experiment":  # which would know of time
                     found = try_scatters(parent.fit.structure, data, parent.fit, scatters)
                     everything += [*found, *_without_chance(found, data)]

@@ -163,14 +163,16 @@ def gain_p(t: Tried, declared: Fit) -> float:
     return min(1.0, chi2_tail(declared.chi2 - t.fit.chi2, freedom) * len(CATALOGUE))
 
 
-def accounts(t: Tried, declared: Fit) -> bool:
-    """Whether the declared model's misfit goes with the effects: more than chance takes away, and
-    most of what exceeds the noise. What takes a part of little may leave the cause behind, under
-    the threshold. A spread has its own penalty."""
+def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
+    """Whether the misfit that is left without one of the effects goes with it: more than chance
+    takes away, and two thirds of what exceeds the noise. What takes a part of little may leave the
+    cause behind, under the threshold. A spread has its own penalty."""
     if t.spread is not None:
         return True
-    excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (declared, t.fit))
-    return gain_p(t, declared) < ALPHA and left < excess / 2
+    fewer = [o.fit for o in tries if o.spread is None and set(o.names) < set(t.names)]
+    without = min([declared, *fewer], key=lambda fit: fit.chi2)
+    excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (without, t.fit))
+    return gain_p(t, without) < ALPHA and left < excess / 3
 
 
 def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
