@@ -253,7 +253,7 @@ def intervals(used: list[dict[str, Any]]) -> None:
         ("the noise floor", [r["validation"][2] for r in traced]),
         ("what noise and parameters let expect", [r["expected"] for r in traced]),
     ):
-        left = [r["validation"][1] / x for r, x in zip(traced, least, strict=True)]
+        left = [r["validation"][1] / x for r, x in zip(traced, least, strict=True) if x == x]
         if left:
             print(f"validation error after over {what}, traced: median {np.median(left):.2f}, "
                   f"95 % below {np.quantile(left, 0.95):.2f}, "
