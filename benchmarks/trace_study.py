@@ -44,6 +44,11 @@ def _time(t: Truth) -> float:
     return 1 / (2 * np.pi * t["pole_hz"])
 
 
+RESONANT: dict[str, Callable[[Truth, int], float]] = {
+    "frequency_hz": lambda t, n: t["frequency_hz"],
+    "damping": lambda t, n: t["damping"],
+}
+
 # (effect, form claimed, variant simulated): parameters of which both sides speak, and their truth.
 # Drifts are simulated over 1200 s and claimed over the campaign, 120 s a run.
 COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, int], float]]] = {
@@ -55,14 +60,8 @@ COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, int], float]]] =
         "frequency_hz": lambda t, n: t["resonance_hz"],
         "damping": lambda t, n: t["damping"],
     },
-    ("acoustic_mode", "mode", ""): {
-        "frequency_hz": lambda t, n: t["frequency_hz"],
-        "damping": lambda t, n: t["damping"],
-    },
-    ("acoustic_mode", "side_resonator", "side_resonator"): {
-        "frequency_hz": lambda t, n: t["frequency_hz"],
-        "damping": lambda t, n: t["damping"],
-    },
+    ("acoustic_mode", "mode", ""): RESONANT,
+    ("acoustic_mode", "side_resonator", "side_resonator"): RESONANT,
     ("actuator_nonlinearity", "quadratic", "distortion"): {"a2": lambda t, n: t["quadratic_per_v"]},
     ("actuator_nonlinearity", "cubic", "compression"): {"a3": lambda t, n: -t["cubic_per_v2"]},
     ("channel_mismatch", "skew", "skew"): {"skew_s": lambda t, n: -t["skew_s"]},

@@ -127,7 +127,7 @@ def diagnose(
     if verdict == "unexplained":
         where = trace.whereabouts(pieces(), base)
         explanation = f"{explanation} {where.words}"
-    after = before if chosen is None else _after(chosen, data)
+    after = before if chosen is None else _after(chosen, data, before.noise_floor)
     before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
     effects = (*_traced(chosen, tried), *tones) if claimed and chosen else tuple(tones)
@@ -149,13 +149,11 @@ def diagnose(
     )
 
 
-def _after(chosen: Tried, data: Dataset) -> Assessment:
+def _after(chosen: Tried, data: Dataset, noise_floor: float) -> Assessment:
     """The chosen model against the data; a spread from run to run counts with its coefficients'
     noise, but not with the noise floor."""
-    if chosen.spread is None:
-        return assess.assess(chosen.fit, data)
-    wide = assess.assess(chosen.fit, chosen.spread.data)
-    return replace(wide, noise_floor=data.noise_floor(data.validation or data.fit))
+    wide = data if chosen.spread is None else chosen.spread.data
+    return replace(assess.assess(chosen.fit, wide), noise_floor=noise_floor)
 
 
 def _better(new: Fit, old: Fit) -> bool:

@@ -183,7 +183,7 @@ class Effect:
 
     def shapes(self, known: "Known") -> list[tuple[float, ...]]:
         """Values at which the effect vanishes whatever shape it would have: zero for its sizes,
-        which are tested at one shape after the other. None where `neutral` says it all."""
+        which are tested at one shape after the other. Empty where `neutral` says it all."""
         return []
 
     def to_internal(self, values: Sequence[float]) -> FloatArray:
@@ -387,15 +387,7 @@ class Structure:
         return 1 + len(self._losses(p, at, self._modes(p, at)))
 
     def _modes(self, p: Values, at: Conditions) -> list[Mode]:
-        modes = [
-            Mode(
-                p[f"mode{i}.frequency_hz"],
-                p[f"mode{i}.damping"],
-                p[f"mode{i}.flame_residue"],
-                p[f"mode{i}.speaker_residue"],
-            )
-            for i in range(1, self.mode_count + 1)
-        ]
+        modes = declared_modes(p, self.mode_count)
         for e in self.effects:
             modes = e.modes(p, at, modes)
         return modes
@@ -453,6 +445,12 @@ def _lagrange_coefficients(nodes: Sequence[float], values: Sequence[Any]) -> lis
     matrix = np.linalg.inv(np.stack([x ** (d + 2) for d in range(x.size)], axis=1))
     excess = [v - xn for v, xn in zip(values, x.tolist(), strict=True)]
     return [_sum(matrix[d, j] * excess[j] for j in range(x.size)) for d in range(x.size)]
+
+
+def declared_modes(p: Values, count: int) -> list[Mode]:
+    """The first `count` modes, without effects."""
+    names = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
+    return [Mode(*(p[f"mode{i}.{n}"] for n in names)) for i in range(1, count + 1)]
 
 
 def resonance(mode: Mode, s: Any) -> Any:

@@ -18,6 +18,7 @@ from identify.structure import (
     Mode,
     Structure,
     Values,
+    declared_modes,
     resonance,
 )
 
@@ -109,10 +110,10 @@ class SideResonator(Effect):
             return []
         f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
         s = 2j * np.pi * f
-        names = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
-        modes = [Mode(*(values[f"mode{i}.{n}"] for n in names)) for i in range(1, self.count + 1)]
+        modes = declared_modes(values, self.count)
         b = np.array([complex(resonance(m, s)) for m in modes])
-        r, a = (np.array([getattr(m, n) for m in modes]) for n in names[2:])
+        r = np.array([m.flame_residue for m in modes])
+        a = np.array([m.speaker_residue for m in modes])
         part = (b * (a * r_e - r * a_e)).imag  # Σ q_i part_i = 0
         q = np.ones(self.count)
         if self.count > 1 and np.all(part[1:] != 0):

@@ -157,10 +157,10 @@ def _extends(t: Tried, best: Tried) -> bool:
     return t.fit.theta.size > best.fit.theta.size and set(best.names) <= set(t.names) | general
 
 
-def gain_p(t: Tried, declared: Fit) -> float:
-    """Likelihood ratio of `t` against the declared model, corrected for the effects asked."""
-    freedom = max(t.fit.theta.size - declared.theta.size, 1)
-    return min(1.0, chi2_tail(declared.chi2 - t.fit.chi2, freedom) * len(CATALOGUE))
+def gain_p(t: Tried, without: Fit) -> float:
+    """Likelihood ratio of `t` against a model with fewer effects, corrected for those asked."""
+    freedom = max(t.fit.theta.size - without.theta.size, 1)
+    return min(1.0, chi2_tail(without.chi2 - t.fit.chi2, freedom) * len(CATALOGUE))
 
 
 def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
