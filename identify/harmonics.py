@@ -8,10 +8,14 @@ frequency is the drive's own, estimated from the drive channel; a free run's is 
 the velocity. What the harmonics leave is noise, and its spectrum within a few hertz of kω gives
 the covariance of c_k, across harmonics too, because jitter of phase or amplitude correlates them.
 A coarse converter adds what these neighbours do not show (`identify.quantisation`).
+
+Foreign tones that are known are fitted beside the harmonics, so that they leak into none. One that
+stands on a harmonic cannot be told from it: its size counts there as noise.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -26,6 +30,10 @@ FloatArray = npt.NDArray[np.float64]
 SIDE_BINS = 20  # neighbours on either side that give a coefficient's noise
 VARIANCE_DOF = 4 * SIDE_BINS  # real degrees of freedom behind each estimated variance
 SEGMENTS = 256  # a record's demodulated signal is averaged to this many points
+APART_BINS = 2.0  # a tone nearer to a harmonic cannot be fitted beside it
+
+
+NO_TONES: Mapping[float, float] = MappingProxyType({})
 
 
 class RecordError(ValueError):
@@ -130,10 +138,13 @@ def microphones(run: Run) -> Microphones | None:
     return Microphones(n1, n2, x1, x2)
 
 
-def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
+def measure(
+    run: Run, medium: Medium, harmonics: int = 7, tones: Mapping[float, float] = NO_TONES
+) -> Harmonics:
     """Fourier coefficients and their noise of one run.
 
-    `harmonics` is reduced to those below 0.45 of the sample rate.
+    `harmonics` is reduced to those below 0.45 of the sample rate. `tones`: foreign ones, peak
+    amplitude of the velocity (m/s) by frequency (Hz).
     """
     values = {n: np.asarray(s.values, dtype=float) for n, s in run.signals.items()}
     for name, x in values.items():
@@ -162,7 +173,9 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
     k = np.arange(1, K + 1)
     omega = 2 * np.pi * frequency * k
     signals = np.stack([*inputs, drive if drive is not None else np.zeros_like(inputs[0])])
-    c, rest = fit_harmonics(signals, rate, frequency, K)
+    near = {f: nearest_harmonic(f, frequency, run.duration_s) for f in tones}
+    apart = [f for f, (_, bins) in near.items() if bins >= APART_BINS]
+    c, rest = fit_harmonics(signals, rate, frequency, K, apart)
     side = side_bins(rest, rate, frequency, K)
     hidden = np.zeros(len(signals))
     for i, name in enumerate([*names, "drive"]):
@@ -187,11 +200,15 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
         noise = -(side[1] - side[0]) / (scale * 1j * (omega + offset))
         pressure_noise = (np.mean(np.abs(side[0] + side[1]) ** 2, axis=0) + hidden[:2].sum()) / 4
         coarse = hidden[:2].sum() / (scale * omega) ** 2
+    covered = np.zeros(K)
+    for f, (order, bins) in near.items():
+        if 1 <= order <= K and bins < APART_BINS:
+            covered[order - 1] += tones[f] ** 2
     drive_c = c[-1]
     reference_c = velocity[0] if run.kind == "free" else drive_c[0]
     turn = np.exp(-1j * np.angle(reference_c) * k)
     noise = noise * turn
-    covariance = coefficient_covariance(noise) + np.diag(np.r_[coarse, coarse] / 2)
+    covariance = coefficient_covariance(noise) + np.diag(np.tile(coarse + covered, 2) / 2)
     stderr = 0.0
     if run.kind == "free":
         both = slice(0, len(inputs))
@@ -217,18 +234,28 @@ def measure(run: Run, medium: Medium, harmonics: int = 7) -> Harmonics:
     )
 
 
+def nearest_harmonic(tone_hz: float, frequency_hz: float, duration_s: float) -> tuple[int, float]:
+    """(order, distance in bins) of the harmonic of `frequency_hz` that is nearest to a tone."""
+    order = round(tone_hz / frequency_hz)
+    return order, abs(tone_hz - order * frequency_hz) * duration_s
+
+
 def fit_harmonics(
-    signals: FloatArray, rate: float, frequency: float, count: int
+    signals: FloatArray, rate: float, frequency: float, count: int, tones: Sequence[float] = ()
 ) -> tuple[ComplexArray, FloatArray]:
     """Coefficients (signals, K) and what remains (signals, samples), by linear least squares.
 
-    A constant is fitted too. For a whole number of periods the normal matrix is diagonal and
-    this is the DFT at the harmonics.
+    A constant is fitted too, and `tones` (Hz), each with an amplitude that grows linearly, which
+    makes up for an error of its frequency. For a whole number of periods and no tone the normal
+    matrix is diagonal and this is the DFT at the harmonics.
     """
     n = signals.shape[1]
     # centred: the best-conditioned time origin
     t = np.asarray((np.arange(n) - (n - 1) / 2) / rate, dtype=np.float64)
     basis = harmonic_basis(t, frequency, count)
+    for f in tones:
+        line = harmonic_basis(t, f, 1)[:2]
+        basis = np.concatenate([basis, line, line * (2 * t / t[-1])])
     normal = basis @ basis.T
     solution = np.linalg.solve(normal, basis @ signals.T)
     rest = signals - solution.T @ basis
@@ -395,11 +422,14 @@ Level = Literal["all", "fit", "validation"]
 
 
 def measure_campaign(
-    campaign: Campaign, harmonics: int = 7, skip: Sequence[str] = ()
+    campaign: Campaign,
+    harmonics: int = 7,
+    skip: Sequence[str] = (),
+    tones: Mapping[float, float] = NO_TONES,
 ) -> list[Harmonics]:
     """All usable runs of a campaign, in the order recorded; `skip` names runs left out."""
     return [
-        measure(run, campaign.medium, harmonics)
+        measure(run, campaign.medium, harmonics, tones)
         for run in campaign.runs
         if run.exit_status == "success" and run.name not in skip
     ]

@@ -77,9 +77,10 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
     """
     chosen = structure or declared_structure(campaign.declared_model)
     found = quality.inspect(campaign)
+    tones = {t.frequency_hz: t.amplitude for t in found.tones}
     measured = [
         h.doubted(DOUBT) if h.name in found.doubted else h
-        for h in harmonics.measure_campaign(campaign, skip=sorted(found.excluded))
+        for h in harmonics.measure_campaign(campaign, skip=sorted(found.excluded), tones=tones)
     ]
     if not any(h.kind == "forced" and h.role == "fit" for h in measured):
         reasons = "; ".join(f"{f.run}: {f.flag}" for f in found.flags if f.run in found.excluded)

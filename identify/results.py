@@ -27,12 +27,14 @@ Verdict = Literal["no_discrepancy", "traced", "ambiguous", "unexplained"]
 
 @dataclass(frozen=True)
 class QualityFlag:
-    """Something wrong with one run's recording. `severity`: noted, down-weighted or excluded."""
+    """Something wrong with one run's recording. `severity`: noted, down-weighted or excluded;
+    `harmonics`: those concerned, if not the whole run."""
 
     run: str
     flag: str
     detail: str
     severity: Literal["noted", "down_weighted", "excluded"] = "noted"
+    harmonics: tuple[int, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -40,6 +42,7 @@ class QualityFlag:
             "flag": self.flag,
             "detail": self.detail,
             "severity": self.severity,
+            "harmonics": list(self.harmonics),
         }
 
 
@@ -311,7 +314,8 @@ PLACES = {
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where an unexplained misfit lies: what a freely shaped piece at each place leaves of it.
+    """Where an unexplained misfit lies: what is left of it with a freely shaped piece, or a known
+    effect that does better, at each place.
 
     `left` is χ²/dof by place, best first, `before` that of the declared model; `likely` are the
     places that are not ruled out, none where no place takes up most of the misfit.
@@ -327,7 +331,7 @@ class Whereabouts:
         if not self.left:
             return "Where it lies is not known: no freely shaped piece could be fitted."
         listed = ", ".join(f"{place} {left:.3g}" for place, left in self.left.items())
-        sizes = f"χ²/dof {self.before:.3g}; with a freely shaped piece in one place: {listed}"
+        sizes = f"χ²/dof {self.before:.3g}; with a free shape or one effect in one place: {listed}"
         if not self.likely:
             return f"No place in the loop takes it up by itself ({sizes})."
         sure = "lies" if len(self.likely) == 1 else "may lie"

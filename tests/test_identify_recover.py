@@ -100,6 +100,31 @@ def test_fourier_coefficients_of_an_incomplete_period() -> None:
     assert np.max(np.abs(rest)) < 1e-11
 
 
+def test_a_known_tone_leaks_into_no_harmonic() -> None:
+    """18.3 bins from the second harmonic it leaks up to 1/(18.3 π) of its amplitude, 3.5e-4. Known
+    to a twentieth of a bin, its phase is off by π/20 at the ends: the square of that is left."""
+    t = np.arange(20000) / 10000.0
+    c = np.array([0.7 - 0.2j, 0.05 + 0.01j, 0.01j])
+    x = sum((ck * np.exp(2j * np.pi * 171.0 * k * t)).real for k, ck in enumerate(c, 1))
+    x = x + 0.02 * np.cos(2 * np.pi * 351.15 * t + 0.4)
+    leaking, _ = fit_harmonics(x[None], 10000.0, 171.0, 3)
+    found, rest = fit_harmonics(x[None], 10000.0, 171.0, 3, [351.175])
+    assert abs(leaking[0] - c)[1] > 1e-4
+    np.testing.assert_allclose(found[0], c, atol=3.5e-4 * (np.pi / 20) ** 2 / 2)
+    assert np.max(np.abs(rest)) < 0.02 * (np.pi / 20) ** 2 / 2
+
+
+@pytest.mark.parametrize(("apart_hz", "counts"), [(0.3, True), (3.0, False)])
+def test_a_tone_on_a_harmonic_is_part_of_its_variance(apart_hz: float, counts: bool) -> None:
+    run = next(r for r in campaign(noise=1e-4, seed=5).runs if r.kind == "forced")
+    assert run.frequency_hz is not None
+    plain = measure(run, Medium())
+    beside = measure(run, Medium(), tones={2 * run.frequency_hz + apart_hz: 1e3})
+    added = beside.variance - plain.variance
+    assert added[1] == pytest.approx(1e6 if counts else 0.0, abs=0.2 * plain.variance[1])
+    np.testing.assert_allclose(added[[0, 2]], 0.0, atol=0.2 * plain.variance[2])
+
+
 def test_frequency_estimate_reaches_the_cramer_rao_bound() -> None:
     rng = np.random.default_rng(3)
     n, rate, noise = 4000, 10000.0, 0.01

@@ -257,6 +257,21 @@ def test_a_tone_in_every_run_is_interference(clean: Campaign, frequency: float, 
     assert len(tone.runs) >= 4
 
 
+@pytest.mark.parametrize("frequency", [504.3, 509.4])
+def test_a_tone_on_a_harmonic_counts_there_as_noise(clean: Campaign, frequency: float) -> None:
+    """Three times 168 and (within 0.3 Hz) 169.7 Hz. At the free cycle's third harmonic a tone is
+    told from the cycle in the forced runs, in which the cycle's fundamental is gone."""
+    found = inspect(edited(clean, line(frequency, 2.0)))
+    assert [t.frequency_hz for t in found.tones] == [pytest.approx(frequency, abs=0.1)]
+    spoilt = {f.run: f for f in found.flags if f.flag == "tone_on_harmonic"}
+    assert list(spoilt) == ["168Hz" if frequency < 505 else "free"]
+    flag = next(iter(spoilt.values()))
+    assert flag.harmonics == (3,)
+    assert flag.severity == "down_weighted"
+    assert flag.to_json()["harmonics"] == [3]
+    assert not found.doubted  # the run's other harmonics are as good as ever
+
+
 def test_a_tone_in_one_run_is_no_interference(clean: Campaign) -> None:
     found, flags, _ = judged(clean, line(433.3, 2.0))
     assert flags == {"foreign_tone": "noted"}

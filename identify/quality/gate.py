@@ -13,7 +13,7 @@ from identify.quality import (
     signs,
     steadiness,
 )
-from identify.quality.tones import Tone, tones
+from identify.quality.tones import Tone, on_harmonics, tones
 from identify.quality.view import View, view
 from identify.record import Campaign
 from identify.results import QualityFlag
@@ -30,8 +30,9 @@ class Quality:
 
     @property
     def doubted(self) -> frozenset[str]:
-        """Names of runs that enter a fit with less weight."""
-        return frozenset(f.run for f in self.flags if f.severity == "down_weighted")
+        """Names of runs that enter a fit with less weight, all their harmonics."""
+        whole = (f for f in self.flags if not f.harmonics)
+        return frozenset(f.run for f in whole if f.severity == "down_weighted")
 
 
 def inspect(campaign: Campaign) -> Quality:
@@ -76,7 +77,7 @@ def inspect(campaign: Campaign) -> Quality:
         flags += steadiness.steadiness(v)
     good = _kept(good, flags)
     found_tones, found = tones(good, free)
-    flags += found
+    flags += [*found, *on_harmonics(good, found_tones)]
     order = {run.name: i for i, run in enumerate(campaign.runs)}
     flags.sort(key=lambda f: order.get(f.run, -1))
     return Quality(tuple(flags), _excluded(flags), found_tones)

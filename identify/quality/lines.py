@@ -1,7 +1,8 @@
 """Lines in a run's spectrum that are not the rig's own: where to look, and what stands out.
 
 Not searched are the bins of the forcing's (or the free cycle's) harmonics, folded ones included,
-and of the combinations of drive and free cycle next to the first harmonics.
+and of the combinations of drive and free cycle next to the first harmonics. What stands on one of
+the free cycle's harmonics and above its fundamental is none of the cycle's.
 """
 
 from dataclasses import dataclass
@@ -68,8 +69,13 @@ def lines(view: View, free: FreeLine | None) -> Lines:
         step = view.run.signals[name].resolution or 0.0
         least = max(SMALLEST * view.level[i], STEPS * step) ** 2
         ratio[i] = np.where(power[i] > least, power[i] / noise, 0.0)
-    relative = np.sum(power / np.maximum(view.level[:, None], 1e-300) ** 2, axis=0)
-    return Lines(view, usable, ratio.max(axis=0), np.where(usable, relative, 0.0))
+    return Lines(view, usable, ratio.max(axis=0), np.where(usable, relative_power(view), 0.0))
+
+
+def relative_power(view: View) -> FloatArray:
+    """Power (bins,) of the channels, each over its fundamental's, added."""
+    level = np.maximum(view.level[:, None], 1e-300)
+    return np.asarray(np.sum((np.abs(view.spectrum) / level) ** 2, axis=0))
 
 
 def expected(view: View, free: FreeLine | None) -> BoolArray:
@@ -91,10 +97,26 @@ def expected(view: View, free: FreeLine | None) -> BoolArray:
     hide(harmonics[~unfolded], 2)
     if free is not None and view.run.kind != "free":
         beat = free.frequency_hz - view.frequency_hz
-        for m in (-3, -2, -1, 1, 2, 3):
-            hide(harmonics[:7] + m * beat, MAIN_LOBE)
-        hide(free.frequency_hz * np.arange(1, 8), MAIN_LOBE)
+        mixed = [harmonics[:7] + m * beat for m in (-3, -2, -1, 1, 2, 3)]
+        cycle = free.frequency_hz * np.arange(1, 8)
+        foreign = cycle[_above_the_first(view, cycle)]
+        near = np.abs(np.concatenate([*mixed, cycle])[:, None] - foreign) < MAIN_LOBE * width
+        hide(np.concatenate([*mixed, cycle])[~near.any(axis=1)], MAIN_LOBE)
     return usable
+
+
+def _above_the_first(view: View, cycle: npt.NDArray[np.floating[Any]]) -> BoolArray:
+    """Which harmonics of the free cycle have a line above all between its fundamental, which the
+    drive pulls, and the drive."""
+    power = relative_power(view)
+    at = np.clip(np.round(cycle / view.bin_hz).astype(int), MAIN_LOBE, power.size - MAIN_LOBE - 1)
+    own = round(view.frequency_hz / view.bin_hz)
+    low, high = min(at[0], own) - MAIN_LOBE, max(at[0], own) + MAIN_LOBE
+    first = float(power[max(low, 0) : high + 1].max())
+    around = at[:, None] + np.arange(-MAIN_LOBE, MAIN_LOBE + 1)
+    above = power[around].max(axis=1) > first
+    above[0] = False
+    return np.asarray(above)
 
 
 def peaks(found: Lines, run: int) -> list[Peak]:

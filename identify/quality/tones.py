@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.chances import chi2_tail
+from identify.harmonics import APART_BINS, nearest_harmonic
 from identify.quality.entrainment import FreeLine
 from identify.quality.findings import finding
 from identify.quality.lines import Lines, Peak, crest, lines, peaks
@@ -94,6 +95,24 @@ def tones(
                 sighting = Sighting(where, p.bin, p.ratio)
                 flags.append(line_flag(sighting, p.frequency_hz, False))
     return tuple(out), flags
+
+
+def on_harmonics(views: Sequence[View], known: Sequence[Tone]) -> list[QualityFlag]:
+    """`tone_on_harmonic`: a known tone stands where it cannot be told from a run's harmonic."""
+    out = []
+    for v in views:
+        for tone in known:
+            order, bins = nearest_harmonic(tone.frequency_hz, v.frequency_hz, 1 / v.bin_hz)
+            if 1 <= order <= v.coefficients.shape[1] and bins < APART_BINS:
+                detail = (
+                    f"harmonic {order}, {order * v.frequency_hz:.2f} Hz, coincides with the tone "
+                    f"at {tone.frequency_hz:.2f} Hz, which counts as noise there "
+                    f"({tone.amplitude:.3g} {tone.unit}); force at another frequency"
+                )
+                out.append(
+                    QualityFlag(v.name, "tone_on_harmonic", detail, "down_weighted", (order,))
+                )
+    return out
 
 
 def clusters(found: Sequence[Peak], width_hz: float) -> list[list[Peak]]:
