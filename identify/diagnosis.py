@@ -125,7 +125,7 @@ def diagnose(
         explanation += " A foreign tone stands in the channels of most runs."
     where = None
     if verdict == "unexplained":
-        where = trace.whereabouts(pieces(), base)
+        where = trace.whereabouts(pieces(), tried, base)
         explanation = f"{explanation} {where.words}"
     after = before if chosen is None else _after(chosen, data, before.noise_floor)
     before, after = _with_lock_in(before, after, data, run)
@@ -281,7 +281,7 @@ def _judge(
             f"Adding {words} takes away all but a trace of the misfit and predicts the validation "
             f"runs as well as noise permits; χ²/dof {near.fit.chi2_per_dof:.2g} is left."
         )  # fmt: skip
-    chosen = ranked[0] if ranked else None
+    chosen = _foremost(ranked)
     left = "" if chosen is None else (
         f" The best, {' + '.join(chosen.names)}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
         "it is reported, not claimed."
@@ -315,6 +315,15 @@ def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried |
     ):
         return best
     return None
+
+
+def _foremost(ranked: Sequence[Tried]) -> Tried | None:
+    """The best of candidates that do not explain the data: the fewest effects that leave no more
+    than three times as much as any do. More of them take up more of whatever there is."""
+    if not ranked:
+        return None
+    near = [t for t in ranked if t.fit.chi2 < 3 * ranked[0].fit.chi2]
+    return min(near, key=lambda t: (len(t.effects), t.fit.chi2))
 
 
 def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:

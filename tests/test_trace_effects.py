@@ -436,9 +436,27 @@ def test_what_no_candidate_explains_is_placed(
     ready = thesis_campaign(tmp_path, 7, {key: values})
     base = start.fit_from_data(ready.structure, ready.data)
     pieces = shaped(ready.structure, ready.data, base, [], InProcess(), lambda share, text: None)
-    found = whereabouts(pieces, base)
+    found = whereabouts(pieces, [], base)
     assert found.likely == (place,), found.words
     assert PLACES[place] in found.words
+
+
+def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
+    tmp_path: Path,
+) -> None:
+    """Hysteresis follows no power of the flame's input: the pieces of other places take more."""
+    ready = thesis_campaign(tmp_path, 7, {"nonlinearity_shape": {"hysteresis_width": 0.0063}})
+    base = start.fit_from_data(ready.structure, ready.data)
+    run, silent = InProcess(), lambda share, text: None
+    pieces = shaped(ready.structure, ready.data, base, [], run, silent)
+    assert whereabouts(pieces, [], base).likely != ("nonlinearity",)
+    tries = trace.try_effects(
+        ready.structure, ready.data, base, [by_key("nonlinearity_shape:hysteresis")],
+        executor=run, keep=1, far=False, progress=silent,
+    )  # fmt: skip
+    found = whereabouts(pieces, tries, base)
+    assert found.likely == ("nonlinearity",), found.words
+    assert found.left["nonlinearity"] == tries[0].fit.chi2_per_dof
 
 
 def test_unexplained_says_where(tmp_path: Path) -> None:

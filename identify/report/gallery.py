@@ -92,7 +92,7 @@ def figures(
             "places",
             "candidates",
             places(result.whereabouts),
-            "Where it lies: what is left with one freely shaped piece in each place of the loop. "
+            "Where it lies: what is left with a free shape or one known effect in each place. "
             "Blue: where it may lie; grey: ruled out, or too little taken up.",
         )
 

@@ -47,7 +47,7 @@ def ranking(d: Diagnosis) -> Figure:
 
 @theme.styled
 def places(found: Whereabouts) -> Figure:
-    """χ² per degree of freedom that a freely shaped piece leaves at each place of the loop."""
+    """χ² per degree of freedom that a free shape or one known effect leaves at each place."""
     names = ["declared model", *(PLACES[p] for p in found.left)]
     chi2 = np.array([found.before, *found.left.values()])
     likely = [theme.AFTER if p in found.likely else theme.NOISE for p in found.left]

@@ -11,8 +11,8 @@
 4. What explains the data must also predict the validation runs, lie in its plausible range, take
    most of the misfit away by more than chance, and have no rival: another effect that does as
    well, complexity counted (`tried`).
-5. Where nothing explains the data, freely shaped pieces say where in the loop it lies
-   (`places`).
+5. Where nothing explains the data, freely shaped pieces and the single effects say where in the
+   loop it lies (`places`).
 """
 
 from identify.trace.places import shaped, whereabouts

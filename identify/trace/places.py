@@ -3,7 +3,8 @@
 A freely shaped piece (`identify.effects.shaped`) is put at each place of the loop in turn and
 fitted like an effect, from the declared fit and from what the best effects make of the declared
 model. The place whose piece takes up most of the misfit, clearly more than any other, is where it
-lies; a place whose piece takes up little is where it is not.
+lies; a place whose piece takes up little is where it is not. A known effect that leaves less than
+the piece of its place speaks for that place: not every law is as smooth as the pieces are.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +21,7 @@ from identify.structure import Structure
 from identify.trace.contests import part_of
 from identify.trace.selection import usable
 from identify.trace.stages import known_sizes, shares_of
-from identify.trace.tried import EVIDENCE, Tried
+from identify.trace.tried import EVIDENCE, Tried, misfit
 from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
@@ -71,10 +72,16 @@ def shaped(
     return sorted(found, key=lambda t: t.fit.chi2)
 
 
-def whereabouts(places: Sequence[Tried], base: Fit) -> Whereabouts:
-    """Where a misfit lies, from what the pieces (`shaped`) leave of that of the fit `base`."""
-    left = {_place(t): t.fit.chi2_per_dof for t in places}
-    return Whereabouts(_likely(places, base.chi2_per_dof), left, base.chi2_per_dof)
+def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> Whereabouts:
+    """Where a misfit lies, from what the pieces (`shaped`) and single effects among `tries` leave
+    of that of the fit `base`."""
+    single = [t for t in tries if len(t.effects) == 1 and t.spread is None and t.plausible]
+    places: dict[str, Tried] = {}
+    for t in sorted([*pieces, *single], key=misfit):
+        places.setdefault(_place(t), t)
+    left = {place: t.fit.chi2_per_dof for place, t in places.items()}
+    likely = _likely(list(places.values()), base.chi2_per_dof)
+    return Whereabouts(likely, left, base.chi2_per_dof)
 
 
 def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit | None:

@@ -270,13 +270,30 @@ def try_effects(
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
         staged.append((task, starts))
         progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
-    if far and not _one_stands_out([s[0].cost for _, s in staged if s], shares[0]):
+    out: list[Tried] = []
+    near = not far or _one_stands_out([s[0].cost for _, s in staged if s], shares[0])
+    if near:
+        out = _refits(tasks, staged, data, executor, keep, progress)
+    if far and not any(t.adequate for t in out):  # what stood out may have been too flexible
         placements = _likely_placements(replace(structure, effects=()), rough)
         tasks = [replace(t, placements=placements) for t in tasks]
         for i, starts in enumerate(executor.map(_from_afar, tasks)):
             both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
             staged[i] = (tasks[i], both)
             progress(0.3 + (i + 1) / len(tasks) * 0.2, f"trying {tasks[i].effect.key} from afar")
+        out += _refits(tasks, staged, data, executor, keep, progress)
+    return sorted(out, key=misfit)
+
+
+def _refits(
+    tasks: Sequence[_Task],
+    staged: Sequence[tuple[_Task, list[CoarseStart]]],
+    data: Dataset,
+    executor: Executor,
+    keep: int,
+    progress: Callable[[float, str], None],
+) -> list[Tried]:
+    """The staged starts led on, the best `keep` to the data's own noise."""
     better = _heats(staged, 5 * keep // 2)
     refined: list[tuple[_Task, list[CoarseStart]]] = []
     for (task, _), starts in zip(better, executor.map(_middle_stage, better), strict=True):
@@ -318,7 +335,7 @@ def try_effects(
             if s and t.effect.name in names and t.effect.key not in done
         ]
         out += refit(rest, 0.95, 1.0)
-    return sorted(out, key=misfit)
+    return out
 
 
 def started_again(singles: Sequence[Tried], data: Dataset, executor: Executor) -> list[Tried]:

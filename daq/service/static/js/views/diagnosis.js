@@ -46,7 +46,7 @@ export async function drawDiagnosis(job) {
     card("", "Candidates, best first", table("", ["effects", "where", "χ²/dof", "validation error", "p of the gain", "parameters", "remarks"], d.candidates.map((c) => [
       c.effects.join(" + "), c.locations.join(", "), num(c.chi2_per_dof, 4), num(c.validation_error, 3), chance(c.p_value), Object.entries(c.parameters).map(([k, p]) => `${k} = ${plusMinus(p)} ${p.unit}`).join("; "),
       [c.plausible ? "" : "implausible", c.equivalent_to.length ? `not told apart from ${c.equivalent_to.join(", ")}` : "", c.note || ""].filter(Boolean).join("; ")]), { numeric: [2, 3, 4], empty: "none was needed" })),
-    d.whereabouts ? card("", "Where it may lie", table("χ²/dof with one freely shaped piece in that place of the loop", ["place", "χ²/dof", "verdict"], [["nowhere: as declared", num(d.whereabouts.before, 4), ""],
+    d.whereabouts ? card("", "Where it may lie", table("χ²/dof with a free shape or one known effect in that place of the loop", ["place", "χ²/dof", "verdict"], [["nowhere: as declared", num(d.whereabouts.before, 4), ""],
       ...Object.entries(d.whereabouts.chi2_per_dof).map(([place, left]) => [place, num(left, 4), d.whereabouts.likely.includes(place) ? "may lie here" : "ruled out, or too little taken up"])], { numeric: [1] })) : "",
     card("", "Next experiment", next ? [h("p", {}, next.reason || next.why || "What to measure to tell the rivals apart:"), h("pre", { class: "scroll", tabindex: "0" }, JSON.stringify(next, null, 1)), h("button", { type: "button", class: "primary", onclick: run }, "Run it")] : h("p", {}, "None is needed.")),
     card("w6", "Parameters before", parameterTable("", d.before.parameters)),
