@@ -116,8 +116,8 @@ def diagnose(
         )  # fmt: skip
 
     verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
-    if chosen is not None and chosen.spread is not None and len(chosen.effects) > 1:
-        # a spread beside an effect takes up much: not where a law could do it that nobody knows
+    if chosen is not None and chosen.spread is not None:
+        # a spread takes up much: not where a law could do it that nobody knows
         tried = trace.against_chance(tried, pieces())
         verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
     if tones and verdict in ("no_discrepancy", "traced"):

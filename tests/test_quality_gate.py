@@ -257,6 +257,18 @@ def test_a_tone_in_every_run_is_interference(clean: Campaign, frequency: float, 
     assert len(tone.runs) >= 4
 
 
+def test_hum_in_a_quiet_free_run_is_no_limit_cycle(clean: Campaign) -> None:
+    """The strongest line of a rig that does not sing: it stands as high in every forced run."""
+    rng = np.random.default_rng(3)
+    silent = edited(clean, pressures(lambda x, t: 0.3 * rng.standard_normal(t.size)), 0)
+    found = inspect(edited(silent, line(50.0, 20.0)))
+    assert found.excluded == {"free"}
+    (flag,) = (f for f in found.flags if f.run == "free")
+    assert flag.flag == "no_limit_cycle"
+    assert "50.00 Hz, stands as high in 6 forced runs of 6" in flag.detail
+    assert [t.frequency_hz for t in found.tones] == [pytest.approx(50.0, abs=0.1)]
+
+
 @pytest.mark.parametrize("frequency", [504.3, 509.4])
 def test_a_tone_on_a_harmonic_counts_there_as_noise(clean: Campaign, frequency: float) -> None:
     """Three times 168 and (within 0.3 Hz) 169.7 Hz. At the free cycle's third harmonic a tone is

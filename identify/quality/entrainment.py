@@ -24,6 +24,10 @@ LINE_SHARE = 0.3  # of the power in BAND (of the frequency) that a limit cycle h
 BAND = 0.3
 PURE = 8.0  # its power over that of the bins beside it
 WORTH_NOTING = 5e-4  # 2 (B/A)² below which nothing is said
+QUENCHED = 0.2  # of a forced run's level: a cycle below that does not survive it …
+ALIKE = 1.4  # … to within such a factor (the window's loss between bins is 1.1)
+LEAST_KEPT = 3
+KEPT_SHARE = 0.75  # of the forced runs that could show it
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,40 @@ def quiet(view: View) -> list[QualityFlag]:
         "around it: no steady limit cycle; nothing to do if the rig is quiet, else record longer"
     )
     return [finding(view.name, "no_limit_cycle", "excluded", detail)]
+
+
+def foreign_cycle(views: Sequence[View]) -> list[QualityFlag]:
+    """`no_limit_cycle`: a free run's line that stands as high in forced runs far above it.
+
+    Such forcing quenches a cycle of the rig's own; a foreign tone it leaves as it is.
+    """
+    forced = [v for v in views if v.run.kind == "forced"]
+    out = []
+    for v in views:
+        if v.run.kind != "free":
+            continue
+        own = float(np.linalg.norm(v.level))
+        strong = [w for w in forced if own < QUENCHED * np.linalg.norm(w.level)]
+        levels = [level for w in strong if (level := _beside(w, v.frequency_hz)) is not None]
+        kept = sum(own / ALIKE < level < own * ALIKE for level in levels)
+        if kept >= LEAST_KEPT and kept > KEPT_SHARE * len(levels):
+            detail = (
+                f"its line, at {v.frequency_hz:.2f} Hz, stands as high in {kept} forced runs of "
+                f"{len(levels)}: a foreign tone, not a limit cycle; nothing to do if the rig is "
+                "quiet, else look for its source"
+            )
+            out.append(finding(v.name, "no_limit_cycle", "excluded", detail))
+    return out
+
+
+def _beside(view: View, frequency_hz: float) -> float | None:
+    """Level of a line in a run's rest; None where it is too near to the run's harmonics."""
+    order = max(1, round(frequency_hz / view.frequency_hz))
+    if abs(frequency_hz - order * view.frequency_hz) < 2 * MAIN_LOBE * view.bin_hz:
+        return None
+    centre = round(frequency_hz / view.bin_hz)
+    around = view.spectrum[:, centre - 1 : centre + 2]
+    return float(np.linalg.norm(np.abs(around), axis=0).max())
 
 
 def side_line(view: View, free: FreeLine | None) -> SideLine | None:

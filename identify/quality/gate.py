@@ -63,6 +63,7 @@ def inspect(campaign: Campaign) -> Quality:
     good = _kept(good, flags)
     flags += [f for v in good for f in forcing.frequency(v)]
     flags += forcing.amplitudes(good)
+    flags += entrainment.foreign_cycle(good)
     good = _kept(good, flags)
     free = entrainment.free_line(good)
     for v in good:

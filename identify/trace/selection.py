@@ -84,9 +84,10 @@ def search(
     level = best_by_name(singles)
     extended: set[tuple[str, ...]] = {()}
     done: set[tuple[str, ...]] = set()
-    for _ in range(2, depth + 1):
+    for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
-        if any(t.explains and (t.spread is None or len(t.effects) > 1) for t in everything):
+        explaining = [t for t in everything if t.explains]
+        if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
         grown: list[Tried] = []
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
@@ -131,13 +132,13 @@ def search(
 
 
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
-    """A law that does better than a spread beside an effect speaks against chance, even one of
-    implausible values, or one of `others`: it stands for one that is not known."""
+    """A law that does better than a spread speaks against chance, even one of implausible values,
+    or one of `others`: it stands for one that is not known."""
     laws = [t.evidence for t in (*tries, *others) if t.spread is None and t.adequate]
     least = min(laws, default=np.inf)
     out = []
     for t in tries:
-        if t.spread is not None and len(t.effects) > 1 and t.evidence > least:
+        if t.spread is not None and t.evidence > least:
             spread = replace(t.spread, objection=t.spread.objection or "a law does better")
             out.append(replace(t, spread=spread))
         else:

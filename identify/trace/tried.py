@@ -165,14 +165,16 @@ def gain_p(t: Tried, without: Fit) -> float:
 
 def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
     """Whether the misfit that is left without one of the effects goes with it: more than chance
-    takes away, and two thirds of what exceeds the noise. What takes a part of little may leave the
-    cause behind, under the threshold. A spread has its own penalty."""
+    takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
+    worse. What takes a part of little may leave the cause behind, under the threshold. A spread
+    has its own penalty."""
     if t.spread is not None:
         return True
-    fewer = [o.fit for o in tries if o.spread is None and set(o.names) < set(t.names)]
-    without = min([declared, *fewer], key=lambda fit: fit.chi2)
+    fewer = [o for o in tries if o.spread is None and set(o.names) < set(t.names)]
+    without = min([declared, *(o.fit for o in fewer)], key=lambda fit: fit.chi2)
     excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (without, t.fit))
-    return gain_p(t, without) < ALPHA and left < excess / 3
+    worse = any(o.validation_error < t.validation_error for o in fewer)
+    return gain_p(t, without) < ALPHA and left < excess / 3 and not worse
 
 
 def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
