@@ -31,8 +31,6 @@ SIDE_BINS = 20  # neighbours on either side that give a coefficient's noise
 VARIANCE_DOF = 4 * SIDE_BINS  # real degrees of freedom behind each estimated variance
 SEGMENTS = 256  # a record's demodulated signal is averaged to this many points
 APART_BINS = 2.0  # a tone nearer to a harmonic cannot be fitted beside it
-
-
 NO_TONES: Mapping[float, float] = MappingProxyType({})
 
 
@@ -174,8 +172,8 @@ def measure(
     omega = 2 * np.pi * frequency * k
     signals = np.stack([*inputs, drive if drive is not None else np.zeros_like(inputs[0])])
     near = {f: nearest_harmonic(f, frequency, run.duration_s) for f in tones}
-    apart = [f for f, (_, bins) in near.items() if bins >= APART_BINS]
-    c, rest = fit_harmonics(signals, rate, frequency, K, apart)
+    on = {f: k for f, (k, bins) in near.items() if 1 <= k <= K and bins < APART_BINS}
+    c, rest = fit_harmonics(signals, rate, frequency, K, [f for f in tones if f not in on])
     side = side_bins(rest, rate, frequency, K)
     hidden = np.zeros(len(signals))
     for i, name in enumerate([*names, "drive"]):
@@ -201,9 +199,8 @@ def measure(
         pressure_noise = (np.mean(np.abs(side[0] + side[1]) ** 2, axis=0) + hidden[:2].sum()) / 4
         coarse = hidden[:2].sum() / (scale * omega) ** 2
     covered = np.zeros(K)
-    for f, (order, bins) in near.items():
-        if 1 <= order <= K and bins < APART_BINS:
-            covered[order - 1] += tones[f] ** 2
+    for f, order in on.items():
+        covered[order - 1] += tones[f] ** 2
     drive_c = c[-1]
     reference_c = velocity[0] if run.kind == "free" else drive_c[0]
     turn = np.exp(-1j * np.angle(reference_c) * k)

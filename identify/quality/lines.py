@@ -97,11 +97,12 @@ def expected(view: View, free: FreeLine | None) -> BoolArray:
     hide(harmonics[~unfolded], 2)
     if free is not None and view.run.kind != "free":
         beat = free.frequency_hz - view.frequency_hz
-        mixed = [harmonics[:7] + m * beat for m in (-3, -2, -1, 1, 2, 3)]
         cycle = free.frequency_hz * np.arange(1, 8)
+        mixed = [harmonics[:7] + m * beat for m in (-3, -2, -1, 1, 2, 3)]
+        own = np.concatenate([*mixed, cycle])
         foreign = cycle[_above_the_first(view, cycle)]
-        near = np.abs(np.concatenate([*mixed, cycle])[:, None] - foreign) < MAIN_LOBE * width
-        hide(np.concatenate([*mixed, cycle])[~near.any(axis=1)], MAIN_LOBE)
+        near = np.abs(own[:, None] - foreign) < MAIN_LOBE * width
+        hide(own[~near.any(axis=1)], MAIN_LOBE)
     return usable
 
 

@@ -270,30 +270,35 @@ def try_effects(
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
         staged.append((task, starts))
         progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
-    out: list[Tried] = []
+    out = _finite(executor.map(_straight, _promising(tasks, executor, keep)), data)
     near = not far or _one_stands_out([s[0].cost for _, s in staged if s], shares[0])
     if near:
-        out = _refits(tasks, staged, data, executor, keep, progress)
-    if far and not any(t.adequate for t in out):  # what stood out may have been too flexible
+        out += _refits(staged, out, data, executor, keep, progress)
+    if far and not (near and any(t.adequate for t in out)):  # it may have been too flexible
         placements = _likely_placements(replace(structure, effects=()), rough)
         tasks = [replace(t, placements=placements) for t in tasks]
         for i, starts in enumerate(executor.map(_from_afar, tasks)):
             both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
             staged[i] = (tasks[i], both)
             progress(0.3 + (i + 1) / len(tasks) * 0.2, f"trying {tasks[i].effect.key} from afar")
-        out += _refits(tasks, staged, data, executor, keep, progress)
+        out += _refits(staged, out, data, executor, keep, progress)
     return sorted(out, key=misfit)
 
 
+def _finite(fits: Iterable[Fit], data: Dataset) -> list[Tried]:
+    return [tried(f.structure.effects, f, data) for f in fits if np.isfinite(f.chi2)]
+
+
 def _refits(
-    tasks: Sequence[_Task],
     staged: Sequence[tuple[_Task, list[CoarseStart]]],
+    straight: Sequence[Tried],
     data: Dataset,
     executor: Executor,
     keep: int,
     progress: Callable[[float, str], None],
 ) -> list[Tried]:
-    """The staged starts led on, the best `keep` to the data's own noise."""
+    """The staged starts led on, the best `keep` to the data's own noise, beside what came
+    `straight` from the base fit."""
     better = _heats(staged, 5 * keep // 2)
     refined: list[tuple[_Task, list[CoarseStart]]] = []
     for (task, _), starts in zip(better, executor.map(_middle_stage, better), strict=True):
@@ -308,24 +313,20 @@ def _refits(
             fits.append(fit)
             key = chosen[i - 1][0].effect.key
             progress(first + i / len(chosen) * (last - first), f"refitting with {key}")
-        return finite(fits)
-
-    def finite(fits: Iterable[Fit]) -> list[Tried]:
-        return [tried(f.structure.effects, f, data) for f in fits if np.isfinite(f.chi2)]
+        return _finite(fits, data)
 
     # two forms of an effect at the most, so that other effects get their turn: first those within
     # reach of the best …
-    out = finite(executor.map(_straight, _promising(tasks, executor, keep)))
-    there = {t.effects[-1].key for t in out if t.adequate}
+    there = {t.effects[-1].key for t in straight if t.adequate}
     chosen = [item for item in _best(refined, keep, forms=2) if item[0].effect.key not in there]
     costs = [starts[0].cost for _, starts in chosen]  # ascending
     near = max(SURELY, sum(cost <= REACH * costs[0] for cost in costs))
-    out += refit(chosen[:near], 0.7, 0.85)
-    if not any(t.explains for t in out):
+    out = refit(chosen[:near], 0.7, 0.85)
+    if not any(t.explains for t in (*straight, *out)):
         out += refit(chosen[near:], 0.85, 0.95)
     # … and then all forms of the best two: at coarse noise they could not be told apart
-    if not any(t.explains for t in out):
-        poor = [t for t in sorted(out, key=misfit) if not t.adequate]
+    if not any(t.explains for t in (*straight, *out)):
+        poor = [t for t in sorted((*straight, *out), key=misfit) if not t.adequate]
         names = list(dict.fromkeys(t.effects[-1].name for t in poor))[:2]
         done = {task.effect.key for task, _ in chosen} | there
         reached = {t.effect.key: s for t, s in refined if s}
