@@ -11,6 +11,7 @@ Campaigns come from the simulated rig's own physics (random rigs, 30 to 80 dB no
 coloured, 4 to 16 runs); the diagnosis sees arrays only. Prints verdicts, wrong claims, a confusion
 table by effect, how often 95 % intervals of traced effects hold the truth and what validation is
 left, and writes one JSON line a campaign to `--out`; `--again FILE` reports on such lines alone.
+With `--given` the true effects are the only candidates: how well their sizes are known, quickly.
 """
 
 import argparse
@@ -147,9 +148,9 @@ def mixed_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]
 OWN_RIG = {"thesis": thesis_rig, "mixed": mixed_rig, "leftout-thesis": thesis_rig}
 
 
-def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
+def one(task: tuple[str, int, str | None, bool]) -> dict[str, Any]:
     """Simulate and diagnose one campaign."""
-    mode, seed, only = task
+    mode, seed, only, given = task
     record: dict[str, Any] = {"seed": seed, "mode": mode}
     made = OWN_RIG[mode](seed) if mode in OWN_RIG else any_rig(mode, seed, only)
     rig, effects, conditions = made
@@ -171,8 +172,11 @@ def one(task: tuple[str, int, str | None]) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            gone = {t["effect"] for t in record["truth"]} if mode.startswith("leftout") else set()
+            there = {t["effect"] for t in record["truth"]}
+            gone = there if mode.startswith("leftout") else set()
             left = [e for e in CANDIDATES if not gone & {e.name, *e.generalises}]
+            if given:
+                left = [e for e in left if e.name in there]
             d = identify.diagnose(campaign, catalogue=left)
     except Exception as error:
         return {**record, "error": f"{type(error).__name__}: {error}"}
@@ -290,6 +294,7 @@ def main() -> int:
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", help="effects whose key starts so")
+    parser.add_argument("--given", action="store_true", help="no candidate but what is there")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--again", type=Path, help="report on the lines of an earlier --out")
@@ -298,7 +303,8 @@ def main() -> int:
         lines = given.again.read_text().splitlines()
         report([r for r in map(json.loads, lines) if r["mode"] == given.mode])
         return 0
-    tasks = [(given.mode, s, given.only) for s in range(given.first, given.first + given.count)]
+    seeds = range(given.first, given.first + given.count)
+    tasks = [(given.mode, s, given.only, given.given) for s in seeds]
     records = []
     with ProcessPoolExecutor(given.jobs) as pool:
         for i, record in enumerate(pool.map(one, tasks)):
