@@ -260,7 +260,8 @@ def _judge(
     good = [t for t in tried if t.explains and trace.accounts(t, base, tried)]
     if good:
         best = trace.best_form(good)
-        others = trace.rivals(best, trace.best_by_name(good))
+        spreads = [t for t in tried if t.spread is not None and not t.explains]
+        others = trace.rivals(best, trace.best_by_name([*good, *spreads]))
         words = " + ".join(best.names)
         if not others:
             open_ = trace.other_forms(best, good)

@@ -20,7 +20,7 @@ from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import fit_scatter
-from identify.structure import Structure
+from identify.structure import Conditions, Structure
 from identify.trace.contests import in_other_forms
 from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import scan
@@ -306,6 +306,22 @@ def test_the_other_forms_of_the_nearest_effect_are_tried(tmp_path: Path) -> None
     assert rivals == []
 
 
+def test_a_resonance_far_above_is_found_from_the_lag_that_it_makes() -> None:
+    """Far below its resonance a speaker lags by 2ζ/ω: the starts have the lag that was fitted."""
+    resonance, delay = by_key("actuator_dynamics:resonance"), by_key("actuator_dynamics:delay")
+    rows = resonance.starts_from(delay, {"actuator_dynamics.delay_s": 7e-5})
+    names = [q.name for q in resonance.parameters]
+    s = 2j * np.pi * np.array([[100.0]])
+    one, none = np.ones(1), np.zeros((1, 1), dtype=complex)
+    whole, false = np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool)
+    at = Conditions(abs(s[0]), none, none, none, 0 * one, one, whole, false, one)
+    for row in rows:
+        response = resonance.actuator(dict(zip(names, row, strict=True)), at, s)
+        assert -np.angle(response[0, 0]) / abs(s[0, 0]) == pytest.approx(7e-5, rel=0.1)
+    assert len({row[1] for row in rows}) == 3
+    assert resonance.starts_from(delay, {"actuator_dynamics.delay_s": -1e-6}) == []
+
+
 def test_a_rival_is_not_ruled_out_for_want_of_iterations(tmp_path: Path) -> None:
     """A second time scale of the flame beside a drift, both small: what it leaves falls slowly."""
     effects = {
@@ -508,3 +524,26 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME])[0]
     kept = against_chance([beside])[0]
     assert (kept.plausible, against_chance([law, beside])[1].plausible) == (True, False)
+
+
+@pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])
+def test_between_spreads_the_likelihood_decides(
+    tmp_path: Path, penalty: float, rival: bool
+) -> None:
+    """One that leaves a lack of fit, far likelier than one that leaves none, remains a rival."""
+    wander = {"modulation_rms": 0.01, "corner_hz": 2.0}
+    ready = thesis_campaign(tmp_path, 7, {"flame_gain_modulation": wander})
+    base = start.fit_from_data(ready.structure, ready.data)
+    flame, drive = try_scatters(ready.structure, ready.data, base, [FLAME, DRIVE])
+    assert flame.spread is not None
+    assert drive.spread is not None
+    best = replace(drive, spread=replace(drive.spread, penalty=300.0, objection=""), fit_p=0.5)
+    chi2 = drive.fit.chi2 + 100.0
+    lacking = replace(
+        flame,
+        fit=replace(flame.fit, chi2=chi2),
+        fit_p=1e-5,
+        spread=replace(flame.spread, penalty=penalty, objection=""),
+    )
+    assert not lacking.explains
+    assert (trace.rivals(best, [best, lacking]) == [lacking]) is rival

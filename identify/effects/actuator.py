@@ -1,5 +1,6 @@
 """Actuator: what stands between the recorded drive and the sound at the speaker."""
 
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +30,13 @@ class SpeakerResonance(Effect):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         f = known.free_hz
         return [(0.6 * f, 0.2), (0.85 * f, 0.15), (1.2 * f, 0.15), (2.0 * f, 0.3), (1.0 * f, 0.4)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From a lag T: far below its resonance a speaker lags by 2ζ/ω."""
+        if self.form != "resonance" or not isinstance(other, VoiceCoil | ActuatorDelay):
+            return super().starts_from(other, values)
+        lag = values[other.parameters[0].name]
+        return [(z / (np.pi * lag), z) for z in (0.15, 0.3, 0.6)] if lag > 0 else []
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
         w = 2 * np.pi * p["actuator_dynamics.frequency_hz"]

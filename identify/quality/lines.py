@@ -1,8 +1,8 @@
 """Lines in a run's spectrum that are not the rig's own: where to look, and what stands out.
 
 Not searched are the bins of the forcing's (or the free cycle's) harmonics, folded ones included,
-and of the combinations of drive and free cycle next to the first harmonics. What stands on one of
-the free cycle's harmonics and above its fundamental is none of the cycle's.
+and of the combinations of drive and free cycle next to the first harmonics. What stands there above
+the free cycle's own line is none of them.
 """
 
 from dataclasses import dataclass
@@ -100,24 +100,23 @@ def expected(view: View, free: FreeLine | None) -> BoolArray:
         cycle = free.frequency_hz * np.arange(1, 8)
         mixed = [harmonics[:7] + m * beat for m in (-3, -2, -1, 1, 2, 3)]
         own = np.concatenate([*mixed, cycle])
-        foreign = cycle[_above_the_first(view, cycle)]
-        near = np.abs(own[:, None] - foreign) < MAIN_LOBE * width
-        hide(own[~near.any(axis=1)], MAIN_LOBE)
+        hide(own[~_above_the_cycle(view, own, beat)], MAIN_LOBE)
     return usable
 
 
-def _above_the_first(view: View, cycle: npt.NDArray[np.floating[Any]]) -> BoolArray:
-    """Which harmonics of the free cycle have a line above all between its fundamental, which the
-    drive pulls, and the drive."""
-    power = relative_power(view)
-    at = np.clip(np.round(cycle / view.bin_hz).astype(int), MAIN_LOBE, power.size - MAIN_LOBE - 1)
-    own = round(view.frequency_hz / view.bin_hz)
-    low, high = min(at[0], own) - MAIN_LOBE, max(at[0], own) + MAIN_LOBE
-    first = float(power[max(low, 0) : high + 1].max())
+def _above_the_cycle(
+    view: View, centres: npt.NDArray[np.floating[Any]], beat_hz: float
+) -> BoolArray:
+    """Where, away from the drive's frequency, a line is above all between that and the free
+    cycle's: no combination of the two is."""
+    power, own = relative_power(view), view.frequency_hz
+    low, high = sorted((own, own + beat_hz))
+    first, last = (round(f / view.bin_hz) for f in (low, high))
+    strongest = float(power[max(first - MAIN_LOBE, 0) : last + MAIN_LOBE + 1].max())
+    at = np.clip(np.round(centres / view.bin_hz).astype(int), MAIN_LOBE, power.size - MAIN_LOBE - 1)
     around = at[:, None] + np.arange(-MAIN_LOBE, MAIN_LOBE + 1)
-    above = power[around].max(axis=1) > first
-    above[0] = False
-    return np.asarray(above)
+    away = np.abs(centres - own) > 3.5 * abs(beat_hz) + MAIN_LOBE * view.bin_hz
+    return np.asarray(away & (power[around].max(axis=1) > strongest))
 
 
 def peaks(found: Lines, run: int) -> list[Peak]:

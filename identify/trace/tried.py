@@ -124,13 +124,14 @@ def _merit(t: Tried) -> tuple[bool, float]:
 def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     """Adequate, plausible sets of other effects that the data do not rule out against `best`.
 
-    What only adds an effect to one of them is none of its own.
+    What only adds an effect to one of them is none of its own. Among spreads the likelihood alone
+    decides: how well the wanderings of a few runs fit a Gaussian says little of their cause.
     """
     found = [
         t
         for t in others
         if t.key != best.key
-        and t.explains
+        and (t.explains or (t.plausible and t.spread is not None and best.spread is not None))
         and t.evidence < best.evidence + EVIDENCE
         and not set(best.names) < set(t.names)
         and not _extends(t, best)
