@@ -371,7 +371,7 @@ def _tone_effects(tones: Sequence[Tone]) -> tuple[TracedEffect, ...]:
             "sensor",
             "tone",
             {
-                "interference.frequency_hz": Estimate(t.frequency_hz, 0.0, "Hz"),
+                "interference.frequency_hz": Estimate(t.frequency_hz, t.frequency_stderr_hz, "Hz"),
                 "interference.amplitude": Estimate(t.amplitude, t.stderr, t.unit),
             },
         )

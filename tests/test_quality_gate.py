@@ -247,6 +247,8 @@ def test_a_tone_in_every_run_is_interference(clean: Campaign, frequency: float, 
     assert not found.excluded
     assert [t.frequency_hz for t in found.tones] == [pytest.approx(frequency, abs=0.1)]
     tone = found.tones[0]
+    assert 0 < tone.frequency_stderr_hz < 0.02  # of bins of half a hertz
+    assert abs(tone.frequency_hz - frequency) < 3 * tone.frequency_stderr_hz
     expected = 0.3 * pascal / (1.2 * 0.0508 * 2 * np.pi * frequency)
     assert tone.amplitude == pytest.approx(expected, rel=0.05)
     assert tone.unit == "m/s"

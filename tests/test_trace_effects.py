@@ -412,6 +412,18 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     assert mode.fit.values["acoustic_mode.frequency_hz"] < 225.0
 
 
+def fitted(parameters: int, chi2_per_dof: float) -> Fit:
+    """A fit of 119 residuals of which only this is looked at."""
+    dof, p = 119 - parameters, parameters
+    none, rest = np.zeros((p, p)), np.zeros(119)
+    chi2 = dof * chi2_per_dof
+    return Fit(Structure(2), np.zeros(p), chi2, dof, none, rest, none, True, "", 1)
+
+
+def found(fit: Fit, *keys: str) -> trace.Tried:
+    return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)
+
+
 @pytest.mark.parametrize(
     ("before", "after", "accounted"),
     [
@@ -427,25 +439,6 @@ def test_a_claim_takes_most_of_the_misfit_away(
 ) -> None:
     """What is adequate because little was left to explain is not the cause for that: neither of
     the declared model's misfit nor, in a pair, of what the other effect leaves."""
-
-    def fitted(parameters: int, chi2_per_dof: float) -> Fit:
-        dof, p = 119 - parameters, parameters
-        none = np.zeros((p, p))
-        return Fit(
-            Structure(2),
-            np.zeros(p),
-            dof * chi2_per_dof,
-            dof,
-            none,
-            np.zeros(119),
-            none,
-            True,
-            "",
-            1,
-        )
-
-    def found(fit: Fit, *keys: str) -> trace.Tried:
-        return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)
 
     delay = found(fitted(11, after), "flame_delay")
     assert trace.accounts(delay, fitted(10, before), []) is accounted
@@ -499,6 +492,20 @@ def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
     found = whereabouts(pieces, tries, base)
     assert found.likely == ("nonlinearity",), found.words
     assert found.left["nonlinearity"] == tries[0].fit.chi2_per_dof
+
+
+def test_a_place_that_takes_up_little_is_ruled_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The best leaves 28 % of 16.9 − 1, and three times as much is nearly all of it."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    left = {
+        "parameter_drift:frequency": 5.5,
+        "nonlinearity_shape:quintic": 9.0,
+        "flame_delay": 15.0,
+    }
+    tries = [replace(found(fitted(11, chi2), key), fit_p=0.0) for key, chi2 in left.items()]
+    where = whereabouts([], tries, fitted(10, 16.9))
+    assert where.likely == ("experiment", "nonlinearity")
+    assert list(where.left) == ["experiment", "nonlinearity", "flame"]
 
 
 def test_unexplained_says_where(tmp_path: Path) -> None:

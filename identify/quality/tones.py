@@ -24,6 +24,7 @@ PURE = 4.0  # power over that of the bins beside it, of a line; of one found alo
 PURE_KNOWN = 1.0  # where other runs have a line: what the chance PRESENT stands for
 PRESENT = 1e-3  # chance below which a known tone counts as present in a run
 ALPHA = 1e-6  # chance of a tone among noise, all runs and bins considered
+CREST_BINS = 0.01  # to which the parabola through a line's three bins places it
 SAME_BINS = 0.75  # peaks this near belong together
 AROUND_BINS = 15.0  # where scattered peaks betray a resonance
 OWN = 0.2  # of the run's frequency, next to which the rig's own resonance stands
@@ -39,6 +40,7 @@ class Tone:
     those where it is significant; `p_value` that of noise doing this anywhere in the spectra."""
 
     frequency_hz: float
+    frequency_stderr_hz: float
     amplitude: float
     stderr: float
     unit: str
@@ -174,10 +176,14 @@ def common(
     noise = amplitude / np.sqrt([max(s.ratio, 1.0) for s in present])
     spread = float(np.std(amplitude, ddof=1)) / np.sqrt(amplitude.size)
     stderr = max(spread, float(np.sqrt(np.sum(noise**2)) / amplitude.size))
+    places = np.array([(s.bin + crest(s.view, s.bin)[0]) * s.view.bin_hz for s in present])
+    wander = float(np.std(places, ddof=1)) / np.sqrt(places.size)
     first = present[0].view
+    placed = float(np.hypot(wander, CREST_BINS * first.bin_hz))
     unit = "m/s" if first.microphones is not None else first.run.signals[first.inputs[0]].unit
     names = tuple(s.view.name for s in present)
-    return Tone(frequency_hz, float(np.mean(amplitude)), stderr, unit, names, p_value)
+    amplitude_mean = float(np.mean(amplitude))
+    return Tone(frequency_hz, placed, amplitude_mean, stderr, unit, names, p_value)
 
 
 def velocity(sighting: Sighting) -> float:

@@ -25,7 +25,8 @@ from identify.trace.tried import EVIDENCE, Tried, misfit
 from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
-TAKEN = 0.3  # share of the excess over noise that the best place may leave
+TAKEN = 0.3  # share of the excess over noise that the best place may leave …
+LITTLE = 0.6  # … and any that is not ruled out
 STARTS = 3
 
 
@@ -34,14 +35,14 @@ def _place(t: Tried) -> str:
 
 
 def _likely(places: Sequence[Tried], before: float) -> tuple[str, ...]:
-    """Those not ruled out: by a third of the χ², or, where the best explains the data, by the
-    evidence; none where even the best leaves much of the misfit."""
+    """Those not ruled out: by a third of the χ², by how little they take up, or, where the best
+    explains the data, by the evidence; none where even the best leaves much of the misfit."""
     if not places:
         return ()
     best = places[0]
     if not best.fit.chi2_per_dof - 1.0 < TAKEN * (before - 1.0):
         return ()
-    limit = CLEARLY * max(best.fit.chi2_per_dof, 1.0)
+    limit = min(CLEARLY * max(best.fit.chi2_per_dof, 1.0), 1.0 + LITTLE * (before - 1.0))
     return tuple(
         _place(t)
         for t in places
