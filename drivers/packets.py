@@ -59,8 +59,8 @@ def parse(data: bytes) -> Parsed:
     while True:
         start = data.find(SYNC, position)
         if start < 0:
-            # The last byte may be the first half of a sync.
-            start = len(data) - data.endswith(SYNC[:1])
+            # The last byte may be the first half of a sync, if it is no packet's.
+            start = len(data) - data.endswith(SYNC[:1], position)
             return Parsed(tuple(packets), data[start:], damaged, skipped + start - position)
         skipped += start - position
         if len(data) - start < HEADER.size:
