@@ -171,9 +171,8 @@ def measure(
     k = np.arange(1, K + 1)
     omega = 2 * np.pi * frequency * k
     signals = np.stack([*inputs, drive if drive is not None else np.zeros_like(inputs[0])])
-    near = {f: nearest_harmonic(f, frequency, run.duration_s) for f in tones}
-    on = {f: k for f, (k, bins) in near.items() if 1 <= k <= K and bins < APART_BINS}
-    c, rest = fit_harmonics(signals, rate, frequency, K, [f for f in tones if f not in on])
+    on = {f: harmonic_under(f, frequency, run.duration_s, K) for f in tones}
+    c, rest = fit_harmonics(signals, rate, frequency, K, [f for f in tones if on[f] is None])
     side = side_bins(rest, rate, frequency, K)
     hidden = np.zeros(len(signals))
     for i, name in enumerate([*names, "drive"]):
@@ -200,7 +199,8 @@ def measure(
         coarse = hidden[:2].sum() / (scale * omega) ** 2
     covered = np.zeros(K)
     for f, order in on.items():
-        covered[order - 1] += tones[f] ** 2
+        if order is not None:
+            covered[order - 1] += tones[f] ** 2
     drive_c = c[-1]
     reference_c = velocity[0] if run.kind == "free" else drive_c[0]
     turn = np.exp(-1j * np.angle(reference_c) * k)
@@ -231,10 +231,13 @@ def measure(
     )
 
 
-def nearest_harmonic(tone_hz: float, frequency_hz: float, duration_s: float) -> tuple[int, float]:
-    """(order, distance in bins) of the harmonic of `frequency_hz` that is nearest to a tone."""
+def harmonic_under(
+    tone_hz: float, frequency_hz: float, duration_s: float, count: int
+) -> int | None:
+    """Which of the first `count` harmonics of `frequency_hz` a tone cannot be told from, if any."""
     order = round(tone_hz / frequency_hz)
-    return order, abs(tone_hz - order * frequency_hz) * duration_s
+    near = abs(tone_hz - order * frequency_hz) * duration_s < APART_BINS
+    return order if near and 1 <= order <= count else None
 
 
 def fit_harmonics(

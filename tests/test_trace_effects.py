@@ -420,7 +420,8 @@ def fitted(parameters: int, chi2_per_dof: float) -> Fit:
     return Fit(Structure(2), np.zeros(p), chi2, dof, none, rest, none, True, "", 1)
 
 
-def found(fit: Fit, *keys: str) -> trace.Tried:
+def tried_as(fit: Fit, *keys: str) -> trace.Tried:
+    """A set of effects with that fit, adequate on both kinds of runs."""
     return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)
 
 
@@ -440,11 +441,11 @@ def test_a_claim_takes_most_of_the_misfit_away(
     """What is adequate because little was left to explain is not the cause for that: neither of
     the declared model's misfit nor, in a pair, of what the other effect leaves."""
 
-    delay = found(fitted(11, after), "flame_delay")
+    delay = tried_as(fitted(11, after), "flame_delay")
     assert trace.accounts(delay, fitted(10, before), []) is accounted
     gross = fitted(9, 1e4)
-    skew = found(fitted(10, before), "channel_mismatch:skew")
-    both = found(fitted(11, after), "channel_mismatch:skew", "flame_delay")
+    skew = tried_as(fitted(10, before), "channel_mismatch:skew")
+    both = tried_as(fitted(11, after), "channel_mismatch:skew", "flame_delay")
     assert trace.accounts(both, gross, [skew, both]) is accounted
     # nor what predicts the held-out runs worse than a part of it does
     worse = replace(both, validation_error=1.5e-3)
@@ -502,7 +503,7 @@ def test_a_place_that_takes_up_little_is_ruled_out(monkeypatch: pytest.MonkeyPat
         "nonlinearity_shape:quintic": 9.0,
         "flame_delay": 15.0,
     }
-    tries = [replace(found(fitted(11, chi2), key), fit_p=0.0) for key, chi2 in left.items()]
+    tries = [replace(tried_as(fitted(11, chi2), key), fit_p=0.0) for key, chi2 in left.items()]
     where = whereabouts([], tries, fitted(10, 16.9))
     assert where.likely == ("experiment", "nonlinearity")
     assert list(where.left) == ["experiment", "nonlinearity", "flame"]

@@ -9,8 +9,10 @@ from identify.results import QualityFlag
 Severity = Literal["noted", "down_weighted", "excluded"]
 
 
-def finding(run: str, flag: str, severity: Severity, detail: str) -> QualityFlag:
-    return QualityFlag(run, flag, detail, severity)
+def finding(
+    run: str, flag: str, severity: Severity, detail: str, harmonics: tuple[int, ...] = ()
+) -> QualityFlag:
+    return QualityFlag(run, flag, detail, severity, harmonics)
 
 
 def decibel(ratio: float) -> float:

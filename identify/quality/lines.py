@@ -69,13 +69,7 @@ def lines(view: View, free: FreeLine | None) -> Lines:
         step = view.run.signals[name].resolution or 0.0
         least = max(SMALLEST * view.level[i], STEPS * step) ** 2
         ratio[i] = np.where(power[i] > least, power[i] / noise, 0.0)
-    return Lines(view, usable, ratio.max(axis=0), np.where(usable, relative_power(view), 0.0))
-
-
-def relative_power(view: View) -> FloatArray:
-    """Power (bins,) of the channels, each over its fundamental's, added."""
-    level = np.maximum(view.level[:, None], 1e-300)
-    return np.asarray(np.sum((np.abs(view.spectrum) / level) ** 2, axis=0))
+    return Lines(view, usable, ratio.max(axis=0), np.where(usable, view.relative_power, 0.0))
 
 
 def expected(view: View, free: FreeLine | None) -> BoolArray:
@@ -109,7 +103,7 @@ def _above_the_cycle(
 ) -> BoolArray:
     """Where, away from the drive's frequency, a line is above all between that and the free
     cycle's: no combination of the two is."""
-    power, own = relative_power(view), view.frequency_hz
+    power, own = view.relative_power, view.frequency_hz
     low, high = sorted((own, own + beat_hz))
     first, last = (round(f / view.bin_hz) for f in (low, high))
     strongest = float(power[max(first - MAIN_LOBE, 0) : last + MAIN_LOBE + 1].max())

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.chances import chi2_tail
-from identify.harmonics import APART_BINS, nearest_harmonic
+from identify.harmonics import harmonic_under
 from identify.quality.entrainment import FreeLine
 from identify.quality.findings import finding
 from identify.quality.lines import Lines, Peak, crest, lines, peaks
@@ -104,16 +104,15 @@ def on_harmonics(views: Sequence[View], known: Sequence[Tone]) -> list[QualityFl
     out = []
     for v in views:
         for tone in known:
-            order, bins = nearest_harmonic(tone.frequency_hz, v.frequency_hz, 1 / v.bin_hz)
-            if 1 <= order <= v.coefficients.shape[1] and bins < APART_BINS:
+            count = v.coefficients.shape[1]
+            order = harmonic_under(tone.frequency_hz, v.frequency_hz, 1 / v.bin_hz, count)
+            if order is not None:
                 detail = (
                     f"harmonic {order}, {order * v.frequency_hz:.2f} Hz, coincides with the tone "
                     f"at {tone.frequency_hz:.2f} Hz, which counts as noise there "
                     f"({tone.amplitude:.3g} {tone.unit}); force at another frequency"
                 )
-                out.append(
-                    QualityFlag(v.name, "tone_on_harmonic", detail, "down_weighted", (order,))
-                )
+                out.append(finding(v.name, "tone_on_harmonic", "down_weighted", detail, (order,)))
     return out
 
 

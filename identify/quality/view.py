@@ -70,6 +70,12 @@ class View:
         return np.asarray(np.fft.rfft(self.rest[: len(self.inputs)] * window(n)) * (2 / n))
 
     @cached_property
+    def relative_power(self) -> FloatArray:
+        """Power (bins,) of the inputs, each over its fundamental's, added."""
+        level = np.maximum(self.level[:, None], 1e-300)
+        return np.asarray(np.sum((np.abs(self.spectrum) / level) ** 2, axis=0))
+
+    @cached_property
     def rotor(self) -> ComplexArray:
         """exp(−jωt) at the samples, (samples,)."""
         turn = -2j * np.pi * self.frequency_hz / self.run.sample_rate_hz
