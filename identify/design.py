@@ -419,7 +419,10 @@ def _reason(names: Sequence[str], chosen: Chosen, verdict: str) -> str:
 def _by_hand(
     rivals: Sequence[Rival], ready: Prepared, reach: Reach, least: float
 ) -> dict[str, Any] | None:
-    """The same with the microphones exchanged, where that tells clearly more."""
+    """The same with the microphones exchanged, where that tells clearly more: never of rivals
+    that say the same of the microphones."""
+    if not any(e.location == "sensor" for r in rivals for e in r.fit.structure.effects):
+        return None
     hands = tell_apart(rivals, ready, reach, by_hand=True)
     if not hands.options or min(hands.pairs.values()) < 2 * least:
         return None

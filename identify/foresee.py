@@ -39,6 +39,7 @@ IntArray = npt.NDArray[np.int64]
 
 SAME_BRANCH = 0.5  # models that differ by more at the fundamental are not on the same branch
 LATER_S = 60.0  # from the campaign's last run to the next one
+SETTLED = 0.05  # of χ²: what a refit may still gain, far less than decides between rivals
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,9 @@ class Past:
         """Least of |R (u − u₀)|² and the new runs' χ² together, and where; None: no orbit there."""
         ahead = _Ahead(self, Straightened(OrbitResidual(self.structure, runs), self.structure))
         bounds = self.straight.bounds(self.structure)
-        (descent,) = levenberg_marquardt(ahead, start[None], iterations=25, bounds=bounds)
+        (descent,) = levenberg_marquardt(
+            ahead, start[None], iterations=25, tolerance=SETTLED, bounds=bounds
+        )
         return None if descent is None else (descent.cost, descent.theta)
 
 

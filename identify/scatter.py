@@ -11,8 +11,8 @@ likeliest x for now. With the tangents T_r and J_r taken there, and e_r = ρ_r(�
 and what they absorb of the runs' deviations must not pass for their smallness. θ for given σ is an
 ordinary fit with widened covariances, to data from which what is not linear in x̂_r has been taken
 off; the two alternate. ln det V is what the freedom costs: a spread never explains for nothing what
-a law explains. A spread must also look random: what follows frequency, amplitude or time, or sits
-in a single run, has another cause.
+a law explains. A spread must also look random (`identify.randomness`): what follows the runs'
+conditions or time, or sits in a single run, has another cause.
 """
 
 from collections.abc import Sequence
@@ -28,13 +28,16 @@ from identify.dataset import Batch, Dataset
 from identify.effects.scatter import Scatter
 from identify.fit import Fit, fit_orbits
 from identify.parameters import Estimate
+from identify.randomness import law_in
 from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.intp]
 
 ROUNDS = 8
 STEPS = 3  # Gauss–Newton steps to a run's likeliest deviation
 LEAST_RUNS = 6  # forced runs below which a spread says nothing
+SQUARED = " squared"
 TREND_P = 0.003  # a rank correlation less probable than this is a law, not chance
 ONE_RUN = 0.9  # share of all deviation that a single run may hold
 SMALLEST = 1e-8
@@ -267,20 +270,66 @@ def _relative_errors(rows: Sequence[_Rows], sizes: FloatArray) -> FloatArray:
 
 def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> str:
     """Why the deviations are not random, in words; empty where nothing speaks against it."""
-    kept = [r for r in rows if not r.batch.free]
-    x = np.concatenate([_likeliest(r, sizes) for r in kept])
+    forced = [r for r in rows if not r.batch.free]
+    x = np.concatenate([_likeliest(r, sizes) for r in forced])
+    there = np.flatnonzero((sizes > 10 * SMALLEST) & (np.ptp(x, axis=0) > 0))
+    names = [scatter.parameters[j].name for j in there]
+    known, ranked, laws = _conditions(forced, scatter)
+    for name, own in zip(names, x[:, there].T, strict=True):
+        if np.max(own**2) > ONE_RUN * np.sum(own**2):
+            return f"{name}: a single run deviates"
+        for word in ranked:
+            # what the parameters could have absorbed and did not, seen in the deviations themselves
+            if np.ptp(known[word]) > 0 and rank_correlation(own, known[word])[1] < TREND_P:
+                return f"{name} follows the {word}: no chance"
+    if not there.size:
+        return ""
+    law = law_in(*_whitened(rows, sizes, there), known, laws)
+    if law is None:
+        return ""
+    which = " and ".join(names[j] for j in law.directions)
+    verb = "follows" if len(law.directions) == 1 else "follow"
+    told = " and ".join(dict.fromkeys(c.removesuffix(SQUARED) for c in law.covariates))
+    return f"{which} {verb} the {told} (p {law.p_value:.1g}): no chance"
+
+
+def _conditions(
+    forced: Sequence[_Rows], scatter: Scatter
+) -> tuple[dict[str, FloatArray], list[str], list[tuple[str, ...]]]:
+    """What the runs' deviations could follow, by name: which in rank, and which in a law."""
+    batches = [r.batch for r in forced]
     known = {
-        "frequency": np.concatenate([r.batch.at.omega for r in kept]),
-        "amplitude": np.concatenate([np.abs(r.batch.at.drive[:, 0]) for r in kept]),
+        "frequency": np.concatenate([b.at.omega for b in batches]),
+        "drive": np.concatenate([np.abs(b.at.drive[:, 0]) for b in batches]),
+        "response": np.concatenate([np.abs(b.measured[:, 0]) for b in batches]),
+        "time": np.concatenate([b.started_s for b in batches]),
     }
+    for name in ("frequency", "time"):
+        known[name + SQUARED] = (known[name] - np.mean(known[name])) ** 2
+    ranked = ["frequency", "drive"]
+    laws: list[tuple[str, ...]] = [("frequency",), ("drive",), ("response",)]
+    laws.append(("frequency", "drive", "response"))
+    laws.append(("drive", "frequency", "frequency" + SQUARED))
     if scatter.location != "experiment":  # what wanders in the course of it may follow the time
-        known["time"] = np.concatenate([r.batch.started_s for r in kept])
-    for j, q in enumerate(scatter.parameters):
-        if sizes[j] < 10 * SMALLEST or np.ptp(x[:, j]) == 0:
-            continue
-        if np.max(x[:, j] ** 2) > ONE_RUN * np.sum(x[:, j] ** 2):
-            return f"{q.name}: a single run deviates"
-        for word, values in known.items():
-            if np.ptp(values) > 0 and rank_correlation(x[:, j], values)[1] < TREND_P:
-                return f"{q.name} follows the {word}: no chance"
-    return ""
+        ranked.append("time")
+        laws += [("time",), ("time", "time" + SQUARED)]
+    return known, ranked, laws
+
+
+def _whitened(
+    rows: Sequence[_Rows], sizes: FloatArray, there: IntArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Residuals (n,) and Jacobian (n, p), whitened by noise and spread, and the forced runs'
+    tangents (n, runs, directions) `there`."""
+    residual, jacobian, tangent = [], [], []
+    for r in rows:
+        L = np.linalg.cholesky(_spread(r, sizes))
+        residual += list(np.linalg.solve(L, r.residual[..., None])[..., 0])
+        jacobian += list(np.linalg.solve(L, r.jacobian))
+        tangent += [(t, r.batch.free) for t in np.linalg.solve(L, r.tangent[..., there])]
+    ends = np.cumsum([e.size for e in residual])
+    forced = [i for i, (_, free) in enumerate(tangent) if not free]
+    deviations = np.zeros((int(ends[-1]), len(forced), there.size))
+    for column, i in enumerate(forced):
+        deviations[ends[i] - residual[i].size : ends[i], column] = tangent[i][0]
+    return np.concatenate(residual), np.concatenate(jacobian), deviations

@@ -529,7 +529,7 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
         ready.structure, ready.data, base, [by_key("flame_delay")], executor=InProcess(), keep=1,
         far=False, progress=lambda share, text: None,
     )[0]  # fmt: skip
-    beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME])[0]
+    beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME], InProcess())[0]
     kept = against_chance([beside])[0]
     assert (kept.plausible, against_chance([law, beside])[1].plausible) == (True, False)
 
@@ -542,7 +542,7 @@ def test_between_spreads_the_likelihood_decides(
     wander = {"modulation_rms": 0.01, "corner_hz": 2.0}
     ready = thesis_campaign(tmp_path, 7, {"flame_gain_modulation": wander})
     base = start.fit_from_data(ready.structure, ready.data)
-    flame, drive = try_scatters(ready.structure, ready.data, base, [FLAME, DRIVE])
+    flame, drive = try_scatters(ready.structure, ready.data, base, [FLAME, DRIVE], InProcess())
     assert flame.spread is not None
     assert drive.spread is not None
     best = replace(drive, spread=replace(drive.spread, penalty=300.0, objection=""), fit_p=0.5)

@@ -4,7 +4,7 @@ A search grows sets one effect at a time and drops what falls behind. Before one
 claimed, what might do as well from where it ended is tried.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -95,17 +95,36 @@ def in_other_forms(
     best = min(good, key=lambda t: t.evidence) if good else min(tries, key=misfit, default=None)
     if best is None:
         return []
-    done = {t.key_of_forms for t in tries if t.adequate} | {best.key_of_forms}
+    done = {t.key_of_forms for t in tries if t.adequate}
+    return _each_in_other_forms([best], data, available, run, done)[0]
+
+
+def _each_in_other_forms(
+    sets: Sequence[Tried],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    done: Collection[tuple[str, ...]] = (),
+) -> list[list[Tried]]:
+    """For each of `sets` its effects in their other forms, but for what (by forms) is `done`."""
     items = []
-    for e in best.effects:
-        kept = tuple(o for o in best.effects if o is not e)
-        for form in available:
-            if form.refines and best.explains:
-                continue
-            if form.name == e.name and key_of_forms((*kept, form)) not in done:
-                items.append((best, kept, e, form, data))
-    fits = run.map(_in_form, items)
-    return [tried(f.structure.effects, f, data) for f in fits if f and np.isfinite(f.chi2)]
+    for t in sets:
+        for e in t.effects:
+            kept = tuple(o for o in t.effects if o is not e)
+            items += [
+                (t, kept, e, form, data)
+                for form in available
+                if form.name == e.name
+                and form.key != e.key
+                and not (form.refines and t.explains)
+                and key_of_forms((*kept, form)) not in done
+            ]
+    items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
+    out: dict[int, list[Tried]] = {id(t): [] for t in sets}
+    for (t, *_), fit in zip(items, run.map(_in_form, items), strict=True):
+        if fit is not None and np.isfinite(fit.chi2):
+            out[id(t)].append(tried(fit.structure.effects, fit, data))
+    return list(out.values())
 
 
 def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) -> Fit | None:
@@ -184,24 +203,23 @@ def reformed(
     run: Executor,
     done: set[tuple[str, ...]],
 ) -> list[Tried]:
-    """Other forms of the best few sets near to the noise, one after the other while that helps.
+    """Other forms of the best few sets near to the noise, and of what comes of them.
 
     Those in `done` (keys of forms) have had theirs; what is seen to here joins them.
     """
     out: list[Tried] = []
-    near = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEAR]
-    for t in near[:REFORMED]:
-        current = t
-        for _ in t.effects:
-            if current.key_of_forms in done:
-                break
-            done.add(current.key_of_forms)
-            found = in_other_forms([current], data, available, run)
-            out += found
-            best = min(found, key=misfit, default=current)
-            if best.explains or not best.fit.chi2 < current.fit.chi2 - EVIDENCE:
-                break
-            current = best
+    ahead = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEAR][:REFORMED]
+    turns = max((len(t.effects) for t in ahead), default=0)
+    for _ in range(turns):
+        current = [t for t in ahead if t.key_of_forms not in done]
+        ahead = []
+        found = [*zip(current, _each_in_other_forms(current, data, available, run), strict=True)]
+        done |= {t.key_of_forms for t in current}
+        for t, others in found:
+            out += others
+            best = min(others, key=misfit, default=t)
+            if not best.explains and best.fit.chi2 < t.fit.chi2 - EVIDENCE:
+                ahead.append(best)
     return out
 
 

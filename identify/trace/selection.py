@@ -10,7 +10,7 @@ from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits
-from identify.scatter import fit_scatter
+from identify.scatter import Spread, fit_scatter
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
     eliminate,
@@ -80,7 +80,7 @@ def search(
     everything = list(singles)
     if not any(t.explains for t in everything):
         report(0.6, "trying run-to-run scatter")
-        everything += try_scatters(structure, data, base, scatters)
+        everything += try_scatters(structure, data, base, scatters, run)
     level = best_by_name(singles)
     extended: set[tuple[str, ...]] = {()}
     done: set[tuple[str, ...]] = set()
@@ -117,7 +117,7 @@ def search(
                 if good and parent.names[0] not in best_form(good).names:
                     continue  # no rival: what explains the data does so without it
                 if parent.effects[0].location != "experiment":  # which would know of time
-                    found = try_scatters(parent.fit.structure, data, parent.fit, scatters)
+                    found = try_scatters(parent.fit.structure, data, parent.fit, scatters, run)
                     everything += [*found, *_without_chance(found, data)]
     if not any(t.explains for t in everything):
         certain = [t for t in everything if t.spread is None]
@@ -189,21 +189,24 @@ def _beside_the_same_chance(
     out: list[Tried] = []
     for t in best_by_name(found):
         if t.explains:
-            out += try_scatters(t.fit.structure, data, t.fit, [chance])
+            out += try_scatters(t.fit.structure, data, t.fit, [chance], run)
     return out
 
 
 def try_scatters(
-    structure: Structure, data: Dataset, base: Fit, scatters: Sequence[Scatter]
+    structure: Structure, data: Dataset, base: Fit, scatters: Sequence[Scatter], run: Executor
 ) -> list[Tried]:
     """Each kind of random difference from run to run on top of `structure`."""
-    out = []
-    for s in scatters:
-        spread = fit_scatter(structure, data, base, s)
-        if spread is not None:
-            t = tried((*structure.effects, s), spread.fit, spread.data)
-            out.append(replace(t, spread=spread))
-    return out
+    spreads = run.map(_scattered, [(structure, data, base, s) for s in scatters])
+    return [
+        replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
+        for s, spread in zip(scatters, spreads, strict=True)
+        if spread is not None
+    ]
+
+
+def _scattered(item: tuple[Structure, Dataset, Fit, Scatter]) -> Spread | None:
+    return fit_scatter(*item)
 
 
 def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:
