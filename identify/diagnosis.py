@@ -37,6 +37,7 @@ from identify.trace import ALPHA, Cancelled, Tried
 Progress = Callable[[float, str], None]
 
 SHOWN = 12  # candidates in the report
+DOUBTFUL = 0.05  # probability of a claim's lack of fit below which free shapes contest it
 
 
 @one_thread
@@ -116,10 +117,10 @@ def diagnose(
         )  # fmt: skip
 
     verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
-    if chosen is not None and chosen.spread is not None:
-        # a spread takes up much: not where a law could do it that nobody knows
+    if chosen is not None and (chosen.spread is not None or chosen.fit_p < DOUBTFUL):
+        # a spread takes up much, and so may a law: not where one does better that nobody knows
         tried = trace.against_chance(tried, pieces())
-        verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
+        verdict, chosen, explanation = _judge(declared.significant, tried, base, data, pieces())
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
@@ -252,12 +253,18 @@ def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float
 
 
 def _judge(
-    significant: bool, tried: Sequence[Tried], base: Fit, data: Dataset
+    significant: bool,
+    tried: Sequence[Tried],
+    base: Fit,
+    data: Dataset,
+    pieces: Sequence[Tried] = (),
 ) -> tuple[Verdict, Tried | None, str]:
-    """Verdict, the candidate it rests on, and the reason in words."""
+    """Verdict, the candidate it rests on, and the reason in words; `pieces` are freely shaped, and
+    what is far less likely than one of them is not claimed."""
     if not significant:
         return "no_discrepancy", None, "The declared model explains the data to within noise."
     good = [t for t in tried if t.explains and trace.accounts(t, base, tried)]
+    good = [t for t in good if not trace.outdone(t, pieces)]
     if good:
         best = trace.best_form(good)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
@@ -287,7 +294,10 @@ def _judge(
         f" The best, {' + '.join(chosen.names)}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
         "it is reported, not claimed."
     )  # fmt: skip
-    if any(t.explains for t in tried):
+    near_it = [t for t in tried if t.explains]
+    if any(trace.outdone(t, pieces) for t in near_it):
+        said = "What comes near to the data is far less likely than a law that nobody here knows."
+    elif near_it:
         said = "What comes near to the data takes too little of the misfit away to be its cause."
     else:
         said = "No known effect explains the data to within noise."

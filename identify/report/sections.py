@@ -362,10 +362,21 @@ def candidates(result: Result) -> str:
     )
 
 
+CAPTIONS = {
+    "pairs": "How much more χ² the wrong one of two is expected to leave with these runs.",
+    "conditions": "The runs to record after a free one.",
+}
+
+
+def told(plan: Mapping[str, Any]) -> dict[str, Any]:
+    """What people are told of a next experiment: all but what is for machines, or empty."""
+    return {k: v for k, v in plan.items() if k != "plan" and v is not None}
+
+
 def next_experiment(result: Result) -> str:
     if not isinstance(result, Diagnosis) or not result.next_experiment:
         return ""
-    plan = {k: v for k, v in result.next_experiment.items() if k != "plan"}  # for machines
+    plan = told(result.next_experiment)
     out = ""
     for key in ("reason", "why", "text"):
         if isinstance(plan.get(key), str):
@@ -374,7 +385,7 @@ def next_experiment(result: Result) -> str:
         if _is_table(value):
             heads = list(dict.fromkeys(k for row in value for k in row))
             rows = [[_cell(row.get(h, "")) for h in heads] for row in value]
-            out += table([_plain(h) for h in heads], rows, _plain(key))
+            out += table([_plain(h) for h in heads], rows, CAPTIONS.get(key, _plain(key)))
             del plan[key]
     left = list(flat(plan))
     return out + (table(["", ""], left) if left else "")

@@ -121,6 +121,5 @@ def _parameters(result: Result, heads: Sequence[str]) -> str:
 def _next(result: Result) -> str:
     if not isinstance(result, Diagnosis) or not result.next_experiment:
         return ""
-    told = {k: v for k, v in result.next_experiment.items() if k != "plan"}
-    rows = [[k, v] for k, v in sections.flat(told)]
+    rows = [[k, v] for k, v in sections.flat(sections.told(result.next_experiment))]
     return "Next experiment\n" + plain_table(["", ""], rows)

@@ -36,6 +36,7 @@ from identify.trace.tried import (
     best_form,
     candidate,
     other_forms,
+    outdone,
     rivals,
 )
 
@@ -53,6 +54,7 @@ __all__ = [
     "candidate",
     "family_p",
     "other_forms",
+    "outdone",
     "refitted",
     "rivals",
     "score_tests",

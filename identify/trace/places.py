@@ -64,13 +64,16 @@ def shaped(
     pieces = [p for p in (piece(data.free_hz) for piece in PIECES) if usable(p, data, structure)]
     best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]
     bases = [base, *(part_of(t, (), data) for t in best)]
-    items = [(structure.with_effects(p), data, bases) for p in pieces]
-    found: list[Tried] = []
-    for piece, fit in zip(pieces, executor.map(_shape, items), strict=True):
-        progress((len(found) + 1) / len(pieces), f"shaping the {piece.location} freely")
-        if fit is not None and np.isfinite(fit.chi2):
-            found.append(as_tried((piece,), fit, data))
-    return sorted(found, key=lambda t: t.fit.chi2)
+    items = [(structure.with_effects(p), data, b) for p in pieces for b in bases]
+    found: dict[str, Fit] = {}
+    for i, fit in enumerate(executor.map(_shape, items)):
+        piece = items[i][0].effects[0]
+        progress((i + 1) / len(items), f"shaping the {piece.location} freely")
+        if fit is not None and fit.chi2 < (
+            found[piece.name].chi2 if piece.name in found else np.inf
+        ):
+            found[piece.name] = fit
+    return sorted((as_tried(f.structure.effects, f, data) for f in found.values()), key=misfit)
 
 
 def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> Whereabouts:
@@ -85,16 +88,14 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
     return Whereabouts(likely, left, base.chi2_per_dof)
 
 
-def _shape(item: tuple[Structure, Dataset, list[Fit]]) -> Fit | None:
-    """The best fit of a structure with one piece, from several fits without it, if any starts."""
-    structure, data, bases = item
+def _shape(item: tuple[Structure, Dataset, Fit]) -> Fit | None:
+    """The fit of a structure with one piece, from a fit without it, if any starts."""
+    structure, data, base = item
     piece = structure.effects[0]
-    fits = []
-    for base in bases:
-        inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
-        first, *others = shares_of(base, data)
-        starts = coarse(structure, data, [np.r_[base.theta, row] for row in inner], first)[:STARTS]
-        if starts:
-            thetas = np.stack([s.theta for s in starts])
-            fits.append(fit_orbits(structure, data, thetas, continuation=(first, *others, 0.0)))
-    return min(fits, key=lambda f: f.chi2, default=None)
+    inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
+    first, *others = shares_of(base, data)
+    starts = coarse(structure, data, [np.r_[base.theta, row] for row in inner], first)[:STARTS]
+    if not starts:
+        return None
+    thetas = np.stack([s.theta for s in starts])
+    return fit_orbits(structure, data, thetas, continuation=(first, *others, 0.0))

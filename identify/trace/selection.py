@@ -100,7 +100,8 @@ def search(
             )  # fmt: skip
         if not grown:
             break
-        if not any(t.adequate for t in grown) and base.chi2_per_dof > GROSS:
+        far = base.chi2_per_dof > GROSS and not explaining
+        if far and not any(t.adequate for t in grown):
             grown = started_again(grown, data, run)
         if not any(t.explains for t in grown):
             report(0.6, "trying other forms of the best")

@@ -178,6 +178,12 @@ def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
     return gain_p(t, without) < ALPHA and left < excess / 3 and not worse
 
 
+def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
+    """Whether a freely shaped piece is far likelier, complexity counted: then the cause is one that
+    nobody has named, and `t` only comes near to it."""
+    return any(p.adequate and p.evidence < t.evidence - EVIDENCE for p in pieces)
+
+
 def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
     """The candidate's line of the report: its gain over the declared model, corrected."""
     own = {q.name for e in t.effects for q in e.parameters}
