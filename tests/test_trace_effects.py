@@ -8,7 +8,7 @@ import pytest
 
 import identify
 from daq.importers import open_campaign
-from identify import assess, balance, start, trace
+from identify import assess, balance, diagnosis, start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -249,10 +249,12 @@ def thesis_campaign(
     seed: int,
     effects: dict[str, dict[str, float]],
     noise_db: float = 36.0,
+    validation: int = 2,
 ) -> Prepared:
     """The thesis's rig with these effects, recorded and prepared."""
     made = [make_effect(key, parameters) for key, parameters in effects.items()]
-    rig, plan = random_campaign(seed, build_config(noise_db=noise_db), made, forced=7, validation=2)
+    rig = build_config(noise_db=noise_db)
+    rig, plan = random_campaign(seed, rig, made, forced=7, validation=validation)
     write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
     return prepare(load_campaign(open_campaign(folder)))
 
@@ -532,6 +534,23 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME], InProcess())[0]
     kept = against_chance([beside])[0]
     assert (kept.plausible, against_chance([law, beside])[1].plausible) == (True, False)
+
+
+def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A cubic loss that no candidate names: one more mode leaves χ²/dof 1.57 at 69 degrees of
+    freedom, which chance leaves once in four hundred times."""
+    loss = {"nonlinear_damping": {"cubic_s_per_m2": 0.7536}}
+    recordings = thesis_campaign(tmp_path, 1050, loss, validation=3).campaign
+    mode = [by_key("acoustic_mode:mode")]
+    found = identify.diagnose(recordings, catalogue=mode)
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert "far less likely than a law" in found.explanation
+    assert found.whereabouts is not None
+    assert "forward" in found.whereabouts.likely
+    monkeypatch.setattr(diagnosis, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
+    assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
 
 
 @pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])
