@@ -67,7 +67,7 @@ class _Rows:
 
 
 def fit_scatter(structure: Structure, data: Dataset, base: Fit, scatter: Scatter) -> Spread | None:
-    """Fit `structure`, which must know nothing of time, with a scatter on top.
+    """Fit `structure` with a scatter on top.
 
     None where there are too few runs, or no likelihood that is finite.
     """
@@ -134,15 +134,14 @@ def _rows(
 ) -> _Rows:
     """Residuals and tangents at deviations `x` (runs, q); None: at none."""
     larger = structure.with_effects(*scatter.directions)
-    late = replace(batch, at=replace(batch.at, time=np.ones(batch.runs)))
     scale = np.array([e.parameters[0].scale for e in scatter.directions])
     p = theta.size
     if x is None:
-        found = assess.predict(larger, np.r_[theta, np.zeros(scale.size)], late)
+        found = assess.predict(larger, np.r_[theta, np.zeros(scale.size)], batch)
         rho, J = found.residual, found.jacobian
     else:
         each = [
-            assess.predict(larger, np.r_[theta, own / scale], late.take(np.array([r])))
+            assess.predict(larger, np.r_[theta, own / scale], batch.take(np.array([r])))
             for r, own in enumerate(x)
         ]
         rho = np.concatenate([f.residual for f in each])

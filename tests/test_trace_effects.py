@@ -553,6 +553,30 @@ def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
 
 
+def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> None:
+    """The drift of the speaker's gain is not the best of the effects alone, nor the modulation
+    enough: it stands out where the modulation has been accounted for."""
+    ready = thesis_campaign(
+        tmp_path,
+        13,
+        {
+            "parameter_drift": {"speaker_gain_change": 0.0015},
+            "flame_gain_modulation": {"modulation_rms": 0.01, "corner_hz": 0.4},
+        },
+    )
+    base = start.fit_from_data(ready.structure, ready.data)
+    forms = ("parameter_drift:speaker_gain", "parameter_drift:flame_gain_curve")
+    laws = [*forms, "nonlinear_damping:quadratic", "flame_delay"]
+    catalogue = [*(by_key(k) for k in laws), *SCATTERS]
+    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
+    best = trace.best_form([t for t in found if t.explains])
+    assert best.key == ("flame_gain_modulation", "parameter_drift")
+    assert best.effects[0].form == "speaker_gain"
+    change = best.estimates["parameter_drift.relative_change"]
+    over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
+    assert abs(change.value - 0.0015 * over) < 4 * change.stderr
+
+
 @pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])
 def test_between_spreads_the_likelihood_decides(
     tmp_path: Path, penalty: float, rival: bool

@@ -17,6 +17,19 @@ def course(at: Conditions, change: Any, curvature: Any = None) -> Any:
     return moved + 1.0
 
 
+def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
+    """The modes with one thing of theirs multiplied."""
+    if what == "frequency":
+        return [replace(m, frequency_hz=m.frequency_hz * factor) for m in modes]
+    if what == "first_mode":
+        return [replace(modes[0], frequency_hz=modes[0].frequency_hz * factor), *modes[1:]]
+    if what == "flame_gain":
+        return [replace(m, flame_residue=m.flame_residue * factor) for m in modes]
+    if what == "damping":
+        return [replace(m, damping=m.damping * factor) for m in modes]
+    return [replace(m, speaker_residue=m.speaker_residue * factor) for m in modes]
+
+
 class Drift(Effect):
     """A relative change over the campaign, linear in time (``_curve``: and quadratic).
 
@@ -48,15 +61,7 @@ class Drift(Effect):
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         curvature = p["parameter_drift.curvature"] if self.curved else None
         factor = course(at, p["parameter_drift.relative_change"], curvature)
-        if self.what == "frequency":
-            return [replace(m, frequency_hz=m.frequency_hz * factor) for m in modes]
-        if self.what == "first_mode":
-            return [replace(modes[0], frequency_hz=modes[0].frequency_hz * factor), *modes[1:]]
-        if self.what == "flame_gain":
-            return [replace(m, flame_residue=m.flame_residue * factor) for m in modes]
-        if self.what == "damping":
-            return [replace(m, damping=m.damping * factor) for m in modes]
-        return [replace(m, speaker_residue=m.speaker_residue * factor) for m in modes]
+        return changed(modes, self.what, factor)
 
 
 class FlamePoleDrift(Effect):

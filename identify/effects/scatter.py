@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from identify import dual
-from identify.effects.experiment import Drift
+from identify.effects.experiment import changed
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Values
+from identify.structure import Conditions, Effect, Mode, Values
 
 
 class Scatter(Effect):
@@ -26,6 +26,22 @@ class Scatter(Effect):
         self.directions = tuple(direction for _, _, direction in sizes)
 
 
+class Change(Effect):
+    """A constant relative change of frequency, flame or speaker gain."""
+
+    location = "experiment"
+
+    def __init__(self, what: str, scale: float) -> None:
+        self.what, self.name = what, f"change_{what}"
+        self.parameters = (Parameter(f"{self.name}.relative", "1", scale=scale),)
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        return changed(modes, self.what, p[self.parameters[0].name] + 1.0)
+
+
 class DrivePhase(Effect):
     """The sound lags the recorded drive by a constant phase."""
 
@@ -39,16 +55,20 @@ class DrivePhase(Effect):
         return dual.exp(p["drive_phase.shift"] * -1j)
 
 
-# A drift's direction, taken at the campaign's end for every run, is a constant relative change.
 SCATTERS: tuple[Scatter, ...] = (
     Scatter(
         "drive_scatter",
         "actuator",
         "",
-        (("gain_rms", "1", Drift("speaker_gain")), ("phase_rms_rad", "rad", DrivePhase())),
+        (("gain_rms", "1", Change("speaker_gain", 1e-2)), ("phase_rms_rad", "rad", DrivePhase())),
     ),
-    Scatter("flame_gain_modulation", "flame", "", (("modulation_rms", "1", Drift("flame_gain")),)),
     Scatter(
-        "parameter_drift", "experiment", "random", (("frequency_rms", "1", Drift("frequency")),)
+        "flame_gain_modulation", "flame", "", (("modulation_rms", "1", Change("flame_gain", 1e-2)),)
+    ),
+    Scatter(
+        "parameter_drift",
+        "experiment",
+        "random",
+        (("frequency_rms", "1", Change("frequency", 1e-3)),),
     ),
 )

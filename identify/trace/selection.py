@@ -20,12 +20,13 @@ from identify.trace.contests import (
     settled,
     with_fewer,
 )
-from identify.trace.scores import ScoreTest
+from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
 from identify.trace.tried import Tried, best_by_name, best_form, misfit, tried
 
 Progress = Callable[[float, str], None]
 
+BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
@@ -117,9 +118,13 @@ def search(
             for parent in parents:
                 if good and parent.names[0] not in best_form(good).names:
                     continue  # no rival: what explains the data does so without it
-                if parent.effects[0].location != "experiment":  # which would know of time
-                    found = try_scatters(parent.fit.structure, data, parent.fit, scatters, run)
-                    everything += [*found, *_without_chance(found, data)]
+                other = [s for s in scatters if s.name not in parent.names]
+                found = try_scatters(parent.fit.structure, data, parent.fit, other, run)
+                everything += [*found, *_without_chance(found, data)]
+            if not any(t.explains for t in everything):
+                alone = [t for t in everything if t.spread is not None and len(t.effects) == 1]
+                found = _beside_chance(alone, data, apart, run)
+                everything += [*found, *_without_chance(found, data)]
     if not any(t.explains for t in everything):
         certain = [t for t in everything if t.spread is None]
         everything += reformed(certain, data, available, run, done)
@@ -161,6 +166,30 @@ def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
     return out
 
 
+def _beside_chance(
+    spreads: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """Effects beside each of `spreads`, which explain nothing alone: those that promise most by
+    their tangents where the spread's own fit is. What changes at random drowns them elsewhere."""
+    out: list[Tried] = []
+    for t in spreads:
+        chance = t.effects[0]
+        assert isinstance(chance, Scatter)
+        assert t.spread is not None
+        base, wide = t.fit, t.spread.data
+        others = [a for a in available if a.name != chance.name]
+        scores = score_tests(base.structure, wide, base, others, run)
+        ranked = sorted((e for e in others if e.key in scores), key=lambda e: -scores[e.key].drop)
+        first = {e.name: e for e in reversed(ranked)}  # the best form of each
+        best = sorted(first.values(), key=lambda e: -scores[e.key].drop)[:BESIDE]
+        for e in best:
+            theta = np.r_[base.theta, scores[e.key].size]
+            larger = base.structure.with_effects(e)
+            fit = fit_orbits(larger, wide, theta, continuation=(0.0,))
+            out += try_scatters(larger, data, fit, [chance], run)
+    return out
+
+
 def _beside_the_same_chance(
     tries: Sequence[Tried],
     data: Dataset,
@@ -182,7 +211,7 @@ def _beside_the_same_chance(
     base = with_fewer(best, (), wide)
     if not np.isfinite(base.chi2):
         return []
-    others = [a for a in available if a.name != law.name and a.location != "experiment"]
+    others = [a for a in available if a.name not in (law.name, chance.name)]
     found = try_effects(
         base.structure, wide, base, others, executor=run, keep=5, far=False,
         progress=lambda share, text: report(0.95 + 0.05 * share, text),
