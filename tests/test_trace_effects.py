@@ -1,5 +1,6 @@
 """Effects that need more than one fit: spreads, gross ones, shapes that nobody knows."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -247,12 +248,13 @@ def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
 def thesis_campaign(
     folder: Path,
     seed: int,
-    effects: dict[str, dict[str, float]],
+    effects: Mapping[str, dict[str, float]] | Sequence[tuple[str, dict[str, float]]],
     noise_db: float = 36.0,
     validation: int = 2,
 ) -> Prepared:
     """The thesis's rig with these effects, recorded and prepared."""
-    made = [make_effect(key, parameters) for key, parameters in effects.items()]
+    pairs = effects.items() if isinstance(effects, Mapping) else effects
+    made = [make_effect(key, parameters) for key, parameters in pairs]
     rig = build_config(noise_db=noise_db)
     rig, plan = random_campaign(seed, rig, made, forced=7, validation=validation)
     write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
@@ -551,6 +553,21 @@ def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     assert "forward" in found.whereabouts.likely
     monkeypatch.setattr(diagnosis, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
+
+
+def test_two_drifts_at_once_are_one_effect_with_two_changes(tmp_path: Path) -> None:
+    both = [
+        ("parameter_drift", {"damping_change": -0.045}),
+        ("parameter_drift", {"flame_gain_change": 0.013}),
+    ]
+    ready = thesis_campaign(tmp_path, 7, both)
+    forms = ("several", "damping", "flame_gain", "frequency_curve", "flame_gain_curve")
+    best, rivals = search_for(ready, *(f"parameter_drift:{form}" for form in forms))
+    assert ([e.form for e in best.effects], rivals) == (["several"], [])
+    over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's changes take
+    for what, truth in (("damping", -0.045), ("flame_gain", 0.013), ("speaker_gain", 0.0)):
+        found = best.estimates[f"parameter_drift.{what}_change"]
+        assert abs(found.value - truth * over) < 4 * found.stderr
 
 
 def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> None:

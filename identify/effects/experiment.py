@@ -64,6 +64,34 @@ class Drift(Effect):
         return changed(modes, self.what, factor)
 
 
+class SeveralDrifts(Effect):
+    """Frequencies, damping, flame and speaker gain change together, each by its own share: what
+    warms changes more than one thing."""
+
+    name, location, form = "parameter_drift", "experiment", "several"
+    parameters = tuple(
+        Parameter(f"parameter_drift.{what}_change", "1", -0.8, 0.8, scale=scale)
+        for what, scale in (
+            ("frequency", 1e-3),
+            ("damping", 1e-2),
+            ("flame_gain", 1e-2),
+            ("speaker_gain", 1e-2),
+        )
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0,) * len(self.parameters)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,) * len(self.parameters)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        for q in self.parameters:
+            what = q.name.removeprefix("parameter_drift.").removesuffix("_change")
+            modes = changed(modes, what, course(at, p[q.name]))
+        return modes
+
+
 class FlamePoleDrift(Effect):
     """The flame's time scale changes over the campaign: an extra factor on the first pole."""
 
@@ -92,4 +120,5 @@ EFFECTS: tuple[Effect, ...] = (
     Drift("frequency_curve"),
     Drift("flame_gain_curve"),
     FlamePoleDrift(),
+    SeveralDrifts(),
 )
