@@ -38,6 +38,8 @@ Progress = Callable[[float, str], None]
 UNSETTLED = 60.0  # of χ² + p ln n: within that, what has not converged may yet be a rival
 NEARBY = 0.7  # of the logarithm, where another form is matched
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
+LED_ON = 4  # of the best of a level that had not converged …
+FARTHEST = 300  # … by so many iterations more
 REFORMED = 3  # sets of effects of which other forms are tried …
 NEAR = 10.0  # … where they leave no more than so much χ²/dof
 
@@ -259,6 +261,25 @@ def in_their_places(
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
     return [eliminate(t, data) for t in out]
+
+
+def led_on(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
+    """The best of `tries` that had not converged, where none explains the data: a gross effect is
+    a long way from the declared fit, whatever its direction."""
+    if any(t.explains for t in tries):
+        return []
+    best: dict[tuple[str, ...], Tried] = {}
+    for t in sorted(tries, key=misfit):
+        best.setdefault(t.key_of_forms, t)
+    far = [t for t in list(best.values())[:LED_ON] if not t.fit.converged]
+    fits = run.map(_further, [(t, data) for t in far])
+    pairs = zip(far, fits, strict=True)
+    return [tried(t.effects, fit, data) for t, fit in pairs if fit.chi2 < t.fit.chi2]
+
+
+def _further(item: tuple[Tried, Dataset]) -> Fit:
+    t, data = item
+    return fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.0,), iterations=FARTHEST)
 
 
 def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:

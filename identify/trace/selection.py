@@ -16,6 +16,7 @@ from identify.trace.contests import (
     eliminate,
     in_other_forms,
     in_their_places,
+    led_on,
     reformed,
     settled,
     with_fewer,
@@ -78,6 +79,7 @@ def search(
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
     singles = [*singles, *in_other_forms(singles, data, available, run)]
+    singles += led_on(singles, data, run)
     everything = list(singles)
     if not any(t.explains for t in everything):
         report(0.6, "trying run-to-run scatter")
@@ -104,6 +106,7 @@ def search(
         far = base.chi2_per_dof > GROSS and not explaining
         if far and not any(t.adequate for t in grown):
             grown = started_again(grown, data, run)
+        grown += led_on(grown, data, run)
         if not any(t.explains for t in grown):
             report(0.6, "trying other forms of the best")
             grown += reformed(grown, data, available, run, done)

@@ -59,10 +59,9 @@ class Tried:
     @property
     def evidence(self) -> float:
         """χ² + p ln n: only compared between adequate candidates."""
-        n, p, cost = self.fit.residual.size, self.fit.theta.size, 0.0
-        if self.spread is not None:
-            p, cost = p + len(self.spread.sizes), self.spread.penalty
-        return self.fit.chi2 + cost + p * float(np.log(n))
+        if self.spread is None:
+            return _evidence(self.fit)
+        return _evidence(self.fit, len(self.spread.sizes)) + self.spread.penalty
 
     @property
     def estimates(self) -> dict[str, Estimate]:
@@ -78,6 +77,11 @@ class Tried:
         return inside and all(
             values[f"mode{i}.damping"] < 0.7 for i in range(1, self.fit.structure.mode_count + 1)
         )
+
+
+def _evidence(fit: Fit, more: int = 0) -> float:
+    """χ² + p ln n of a fit, and of so many parameters more."""
+    return fit.chi2 + (fit.theta.size + more) * float(np.log(fit.residual.size))
 
 
 def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -168,12 +172,12 @@ def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
     """Whether the misfit that is left without one of the effects goes with it: more than chance
     takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
     worse. What takes a part of little may leave the cause behind, under the threshold. A spread
-    has its own penalty."""
-    if t.spread is not None:
-        return True
+    does so by widening the noise: its likelihood is penalised for that, and must still gain."""
     fewer = [o for o in tries if o.spread is None and set(o.names) < set(t.names)]
     without = min([declared, *(o.fit for o in fewer)], key=lambda fit: fit.chi2)
     excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (without, t.fit))
+    if t.spread is not None:
+        return left < excess / 3 and t.evidence < _evidence(without) - EVIDENCE
     worse = any(o.validation_error < t.validation_error for o in fewer)
     return gain_p(t, without) < ALPHA and left < excess / 3 and not worse
 
