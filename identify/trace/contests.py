@@ -4,7 +4,7 @@ A search grows sets one effect at a time and drops what falls behind. Before one
 claimed, what might do as well from where it ended is tried.
 """
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 
@@ -272,8 +272,12 @@ def led_on(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
     for t in sorted(tries, key=misfit):
         best.setdefault(t.key_of_forms, t)
     far = [t for t in list(best.values())[:LED_ON] if not t.fit.converged]
-    fits = run.map(_further, [(t, data) for t in far])
-    pairs = zip(far, fits, strict=True)
+    return _where_better(far, run.map(_further, [(t, data) for t in far]), data)
+
+
+def _where_better(tries: Sequence[Tried], fits: Iterable[Fit], data: Dataset) -> list[Tried]:
+    """Those of `tries` that were fitted again to a lower misfit, so."""
+    pairs = zip(tries, fits, strict=True)
     return [tried(t.effects, fit, data) for t, fit in pairs if fit.chi2 < t.fit.chi2]
 
 
@@ -296,9 +300,7 @@ def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]
         for t in best_by_name([t for t in tries if t.spread is None])
         if not t.fit.converged and t.evidence < least
     ]
-    fits = run.map(_to_the_end, [(t, data) for t in near])
-    pairs = zip(near, fits, strict=True)
-    return [tried(t.effects, fit, data) for t, fit in pairs if fit.chi2 < t.fit.chi2]
+    return _where_better(near, run.map(_to_the_end, [(t, data) for t in near]), data)
 
 
 def _to_the_end(item: tuple[Tried, Dataset]) -> Fit:

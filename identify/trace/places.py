@@ -69,9 +69,8 @@ def shaped(
     for i, fit in enumerate(executor.map(_shape, items)):
         piece = items[i][0].effects[0]
         progress((i + 1) / len(items), f"shaping the {piece.location} freely")
-        if fit is not None and fit.chi2 < (
-            found[piece.name].chi2 if piece.name in found else np.inf
-        ):
+        least = found[piece.name].chi2 if piece.name in found else np.inf
+        if fit is not None and fit.chi2 < least:
             found[piece.name] = fit
     return sorted((as_tried(f.structure.effects, f, data) for f in found.values()), key=misfit)
 
