@@ -183,9 +183,10 @@ def _beside_chance(
         others = [a for a in available if a.name != chance.name]
         scores = score_tests(base.structure, wide, base, others, run)
         ranked = sorted((e for e in others if e.key in scores), key=lambda e: -scores[e.key].drop)
-        first = {e.name: e for e in reversed(ranked)}  # the best form of each
-        best = sorted(first.values(), key=lambda e: -scores[e.key].drop)[:BESIDE]
-        for e in best:
+        first: dict[str, Effect] = {}  # the best form of each
+        for e in ranked:
+            first.setdefault(e.name, e)
+        for e in list(first.values())[:BESIDE]:
             theta = np.r_[base.theta, scores[e.key].size]
             larger = base.structure.with_effects(e)
             fit = fit_orbits(larger, wide, theta, continuation=(0.0,))
