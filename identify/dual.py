@@ -169,6 +169,11 @@ def tanh(x: Operand) -> Any:
     return _apply(x, v, 1.0 - v * v) if isinstance(x, Dual) else v
 
 
+def arctan(x: Operand) -> Any:
+    v = np.arctan(value(x))
+    return _apply(x, v, 1.0 / (1.0 + x.v * x.v)) if isinstance(x, Dual) else v
+
+
 def sin(x: Operand) -> Any:
     return _apply(x, np.sin(x.v), np.cos(x.v)) if isinstance(x, Dual) else np.sin(x)
 

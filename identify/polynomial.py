@@ -33,6 +33,10 @@ class Polynomial:
             total[d - 1] = total[d - 1] + c
         return Polynomial(tuple(total), self.bent)
 
+    def bending(self, b: Any) -> "Polynomial":
+        """The same with b w|w| more."""
+        return Polynomial(self.coefficients, b if self.bent is None else b + self.bent)
+
     def table(self, rows: int) -> FloatArray:
         """Plain values (rows, degree + 1): b first, then c_1, c_2, …"""
         columns = [0.0 if self.bent is None else self.bent, *self.coefficients]

@@ -1,6 +1,5 @@
 """Effects that need more than one fit: spreads, gross ones, shapes that nobody knows."""
 
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from identify.executor import InProcess
 from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
-from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import fit_scatter
@@ -31,43 +29,12 @@ from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import EFFECTS, make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
+from tests.trace_material import campaign, only, recorded, search_for, thesis_campaign
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
 DRIVE = next(s for s in SCATTERS if s.name == "drive_scatter")
 FLAME = next(s for s in SCATTERS if s.name == "flame_gain_modulation")
-
-
-def campaign(
-    folder: Path,
-    seed: int,
-    key: str,
-    drive_noise_v: float = 0.0,
-    noise_db: float = 60.0,
-    **parameters: float,
-) -> Campaign:
-    """A random two-mode rig with one effect: its campaign as read from disk."""
-    rig = random_rig(seed, noise_db=noise_db, modes=(2,))
-    effects = [make_effect(key, parameters)] if key else []
-    rig, plan = random_campaign(seed, rig, effects, forced=9, validation=2)
-    rig = replace(rig, converter=replace(rig.converter, drive_noise_v=drive_noise_v))
-    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
-    return load_campaign(open_campaign(folder))
-
-
-def recorded(folder: Path, seed: int, key: str, **parameters: float) -> tuple[Prepared, Fit]:
-    """Such a campaign prepared, and the declared fit."""
-    ready = prepare(campaign(folder, seed, key, **parameters))
-    return ready, start.fit_from_data(ready.structure, ready.data)
-
-
-def only(ready: Prepared, base: Fit, key: str) -> trace.Tried:
-    """The best fit with that effect and no other tried."""
-    found = trace.try_effects(
-        ready.structure, ready.data, base, [by_key(key)], executor=InProcess(), keep=1,
-        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
-    )  # fmt: skip
-    return trace.started_again(found, ready.data, InProcess())[0]
 
 
 def deviance(ready: Prepared, base: Fit, name: str) -> float:
@@ -243,30 +210,6 @@ def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
     best = trace.best_form([t for t in found.tried if t.adequate and t.plausible])
     names = {best.key, *(t.key for t in trace.rivals(best, trace.best_by_name(found.tried)))}
     assert names == {("flame_delay", "parameter_drift"), ("flame_dynamics", "parameter_drift")}
-
-
-def thesis_campaign(
-    folder: Path,
-    seed: int,
-    effects: Mapping[str, dict[str, float]] | Sequence[tuple[str, dict[str, float]]],
-    noise_db: float = 36.0,
-    validation: int = 2,
-) -> Prepared:
-    """The thesis's rig with these effects, recorded and prepared."""
-    pairs = effects.items() if isinstance(effects, Mapping) else effects
-    made = [make_effect(key, parameters) for key, parameters in pairs]
-    rig = build_config(noise_db=noise_db)
-    rig, plan = random_campaign(seed, rig, made, forced=7, validation=validation)
-    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
-    return prepare(load_campaign(open_campaign(folder)))
-
-
-def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tried]]:
-    """The best explanation by these effects, and its rivals."""
-    base = start.fit_from_data(ready.structure, ready.data)
-    found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
-    best = trace.best_form([t for t in found.tried if t.explains])
-    return best, trace.rivals(best, trace.best_by_name(found.tried))
 
 
 def test_what_stands_out_and_does_not_explain_keeps_none_from_a_start_afar(tmp_path: Path) -> None:

@@ -60,6 +60,30 @@ class VoiceCoil(Effect):
         return 1.0 / (s * p["actuator_dynamics.time_s"] + 1.0)
 
 
+class LaggingResonance(Effect):
+    """A second-order speaker behind a first-order lag: its resonance and its coil, or a plenum."""
+
+    name, location, form = "actuator_dynamics", "actuator", "resonance_pole"
+    parameters = (
+        *SpeakerResonance("resonance").parameters,
+        Parameter("actuator_dynamics.time_s", "s", 0.0, 0.1, scale=1e-4),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        lag = 0.03 / known.free_hz
+        return [(*row, lag) for row in SpeakerResonance("resonance").starts(known)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        if other.form != "resonance":
+            return []
+        f, z = (values[q.name] for q in other.parameters)
+        return [(f, z, 0.0), (f, z, 0.1 / f)]
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        lag = s * p["actuator_dynamics.time_s"] + 1.0
+        return SpeakerResonance("resonance").actuator(p, at, s) / lag
+
+
 class ActuatorDelay(Effect):
     """A delay between the recorded drive and the sound.
 
@@ -144,6 +168,24 @@ class HardClipping(Effect):
         return dual.chain(cut @ back, (moved @ back, level))
 
 
+class Crossover(Effect):
+    """An amplifier that passes nothing within ± a level, and beyond it what exceeds it."""
+
+    name, location, form = "actuator_nonlinearity", "actuator", "crossover"
+    parameters = (Parameter("actuator_nonlinearity.level_v", "V", 1e-9, np.inf, "positive"),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(share * known.drive_amplitude,) for share in (0.005, 0.03, 0.1)]
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        forth, back = _finely(at.harmonics)
+        level = p["actuator_nonlinearity.level_v"]
+        wave = np.concatenate([u.real, u.imag], axis=1) @ forth
+        side = np.sign(wave) * (np.abs(wave) > dual.value(level))
+        passed = wave * np.abs(side) - dual.value(level) * side
+        return dual.chain(passed @ back, (-(side @ back), level))
+
+
 class Knee(Effect):
     """An amplifier near its rails: u / (1 + |u/L|ⁿ)^(1/n), linear below L, ± L above.
 
@@ -187,6 +229,7 @@ EFFECTS: tuple[Effect, ...] = (
     SpeakerResonance("resonance"),
     SpeakerResonance("acceleration"),
     VoiceCoil(),
+    LaggingResonance(),
     ActuatorDelay(),
     Distortion((2,)),
     Distortion((3,)),
@@ -194,5 +237,6 @@ EFFECTS: tuple[Effect, ...] = (
     Distortion((3, 5)),
     Clipping(),
     HardClipping(),
+    Crossover(),
     Knee(),
 )

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
@@ -17,12 +18,19 @@ def course(at: Conditions, change: Any, curvature: Any = None) -> Any:
     return moved + 1.0
 
 
+def settling(at: Conditions, change: Any, time: Any) -> Any:
+    """The same towards 1 + change, exponentially within `time`, as a share of the campaign's."""
+    return (1.0 - dual.exp(-(at.time[:, None] / time))) * change + 1.0
+
+
 def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
     """The modes with one thing of theirs multiplied."""
     if what == "frequency":
         return [replace(m, frequency_hz=m.frequency_hz * factor) for m in modes]
     if what == "first_mode":
         return [replace(modes[0], frequency_hz=modes[0].frequency_hz * factor), *modes[1:]]
+    if what == "first_damping":
+        return [replace(modes[0], damping=modes[0].damping * factor), *modes[1:]]
     if what == "flame_gain":
         return [replace(m, flame_residue=m.flame_residue * factor) for m in modes]
     if what == "damping":
@@ -31,10 +39,12 @@ def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
 
 
 class Drift(Effect):
-    """A relative change over the campaign, linear in time (``_curve``: and quadratic).
+    """A relative change over the campaign, linear in time; ``_curve``: and quadratic;
+    ``_settling``: towards a last value, as what warms up does.
 
     ``frequency``: all modal frequencies together, as temperature does; ``flame_gain``: the fuel;
-    ``damping``; ``speaker_gain``: a warming voice coil; ``first_mode``: mode 1's frequency alone.
+    ``damping``; ``speaker_gain``: a warming voice coil; ``first_mode`` and ``first_damping``: mode
+    1's frequency or damping alone.
     Time is 0 at the campaign's start, 1 at the start of its last run.
     """
 
@@ -42,25 +52,35 @@ class Drift(Effect):
 
     def __init__(self, form: str) -> None:
         self.form = form
-        self.what = form.removesuffix("_curve")
-        self.curved = form.endswith("_curve")
+        self.what = form.removesuffix("_curve").removesuffix("_settling")
+        self.curved, self.settles = form.endswith("_curve"), form.endswith("_settling")
         scale = 1e-3 if "frequency" in form or "mode" in form else 1e-2
-        names = ["relative_change"] + (["curvature"] if self.curved else [])
-        self.parameters = tuple(
-            Parameter(f"parameter_drift.{n}", "1", -0.8, 0.8, scale=scale) for n in names
+        change, curvature = (
+            Parameter(f"parameter_drift.{n}", "1", -0.8, 0.8, scale=scale)
+            for n in ("relative_change", "curvature")
         )
+        time = Parameter("parameter_drift.settling_time", "1", 0.15, 5.0, "positive")
+        more = (curvature,) if self.curved else (time,) if self.settles else ()
+        self.parameters = (change, *more)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         size = self.parameters[0].scale
-        rest = (0.0,) * (len(self.parameters) - 1)
+        rest = (0.3,) if self.settles else (0.0,) * (len(self.parameters) - 1)
         return [(sign * q * size, *rest) for q in (1.0, 5.0, 20.0) for sign in (1.0, -1.0)]
 
-    def neutral(self) -> tuple[float, ...]:
-        return (0.0,) * len(self.parameters)
+    def neutral(self) -> tuple[float, ...] | None:
+        return None if self.settles else (0.0,) * len(self.parameters)
+
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0, q) for q in (0.17, 0.3, 0.6)] if self.settles else []
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
-        curvature = p["parameter_drift.curvature"] if self.curved else None
-        factor = course(at, p["parameter_drift.relative_change"], curvature)
+        change = p["parameter_drift.relative_change"]
+        if self.settles:
+            factor = settling(at, change, p["parameter_drift.settling_time"])
+        else:
+            curvature = p["parameter_drift.curvature"] if self.curved else None
+            factor = course(at, change, curvature)
         return changed(modes, self.what, factor)
 
 
@@ -93,10 +113,17 @@ class SeveralDrifts(Effect):
 
 
 class FlamePoleDrift(Effect):
-    """The flame's time scale changes over the campaign: an extra factor on the first pole."""
+    """The flame's time scale changes over the campaign: a factor on the first pole.
 
-    name, location, form = "parameter_drift", "experiment", "flame_pole"
+    ``flame_pole``: its answer to slow changes stays, ω/(s + ω); ``flame_rate``: that to fast ones
+    does, 1/(s + ω).
+    """
+
+    name, location = "parameter_drift", "experiment"
     parameters = (Parameter("parameter_drift.relative_change", "1", -0.8, 0.8, scale=1e-2),)
+
+    def __init__(self, form: str) -> None:
+        self.form = form
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.01,), (-0.01,)]
@@ -107,8 +134,25 @@ class FlamePoleDrift(Effect):
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         pole = 2 * 3.141592653589793 * p["flame.pole_hz"]
         moved = pole * (p["parameter_drift.relative_change"] * at.time[:, None] + 1.0)
-        # unit static gain is kept: ω/(s + ω) is what moves
-        return (s + pole) / (s + moved) * (moved / pole)
+        kept = moved / pole if self.form == "flame_pole" else 1.0
+        return (s + pole) / (s + moved) * kept
+
+
+class FlameInputDrift(Effect):
+    """The flame's answer to the velocity changes over the campaign before its characteristic: the
+    linear gain, and with it the amplitude at which it saturates."""
+
+    name, location, form = "parameter_drift", "experiment", "flame_input"
+    parameters = (Parameter("parameter_drift.relative_change", "1", -0.8, 0.8, scale=1e-2),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.01,), (-0.01,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return course(at, p["parameter_drift.relative_change"]) + 0.0 * s
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -116,9 +160,14 @@ EFFECTS: tuple[Effect, ...] = (
     Drift("first_mode"),
     Drift("flame_gain"),
     Drift("damping"),
+    Drift("first_damping"),
     Drift("speaker_gain"),
     Drift("frequency_curve"),
+    Drift("frequency_settling"),
     Drift("flame_gain_curve"),
-    FlamePoleDrift(),
+    Drift("flame_gain_settling"),
+    FlameInputDrift(),
+    FlamePoleDrift("flame_pole"),
+    FlamePoleDrift("flame_rate"),
     SeveralDrifts(),
 )

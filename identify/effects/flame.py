@@ -44,17 +44,20 @@ class ExtraPole(Effect):
 
 
 class SecondTimeScale(Effect):
-    """A second, parallel time scale: 1 − share + share/(1 + sT)."""
+    """A second, parallel time scale: 1 − share + share/(1 + sT).
+
+    A negative share leads: it is a zero at the time (1 − share) T above the pole's.
+    """
 
     name, location, form = "flame_dynamics", "flame", "second_time_scale"
     parameters = (
-        Parameter("flame_dynamics.share", "1", -2.0, 2.0),
+        Parameter("flame_dynamics.share", "1", -50.0, 2.0),
         Parameter("flame_dynamics.time_s", "s", 1e-6, 1.0, "positive"),
     )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         period = 1 / known.free_hz
-        return [(0.1, 0.05 * period), (0.1, 0.5 * period)]
+        return [(0.1, 0.05 * period), (0.1, 0.5 * period), (-3.0, 0.01 * period)]
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.0, float(q) / known.free_hz) for q in np.geomspace(0.01, 2.0, 12)]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -26,55 +26,84 @@ from identify.structure import (
 class AcousticMode(Effect):
     """One more acoustic mode, of the same four parameters as the declared ones.
 
-    A weakly coupled side resonator or plenum appears as one more mode too.
+    A weakly coupled side resonator or plenum appears as one more mode too. With the form
+    ``two_modes`` two more, tried where one alone does not explain the data.
     """
 
-    name, location, form = "acoustic_mode", "forward", "mode"
-    parameters = (
-        Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
-        Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
-        Parameter("acoustic_mode.flame_residue", "1/s"),
-        Parameter("acoustic_mode.speaker_residue", "m/s²/V"),
-    )
+    name, location = "acoustic_mode", "forward"
+
+    def __init__(self, form: str = "mode", more: int = 1) -> None:
+        self.form, self.more = form, more
+        self.refines = more > 1
+        self.parameters = tuple(
+            q for i in range(1, more + 1) for q in _mode_parameters("" if i == 1 else str(i))
+        )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        r, a = known.flame_residues[0], known.speaker_residues[0]
+        r, a = 0.02 * known.flame_residues[0], 0.02 * known.speaker_residues[0]
         ratios = (0.55, 1.45, 1.85, 2.33, 2.75, 3.3)
-        return [(q * known.free_hz, 0.04, 0.02 * r, 0.02 * a) for q in ratios]
+        return [
+            tuple(x for q in chosen for x in (q * known.free_hz, 0.04, r, a))
+            for chosen in combinations(ratios, self.more)
+        ]
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        if self.more > 1:
+            return []
         frequencies = known.free_hz * np.geomspace(0.4, 4.0, 48)
         return [(float(f), zeta, 0.0, 0.0) for f in frequencies for zeta in (0.012, 0.05)]
 
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        return []  # its own starts, of all modes at once, reach farther
+
     def restated(self, structure: Structure) -> Structure | None:
-        return replace(structure, mode_count=structure.mode_count + 1)
+        return replace(structure, mode_count=structure.mode_count + self.more)
 
     def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
-        """Which of the modes is the further one is a matter of naming: here the one that takes
-        the smallest part in the response near mode 1, which sings and is never the one."""
+        """Which of the modes are the further ones is a matter of naming: here those that take
+        the smallest part in the response near mode 1, which sings and is never one of them."""
         kinds = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
-        table = [
-            [values[f"mode{i}.{k}"] for k in kinds] for i in range(1, structure.mode_count + 2)
-        ]
+        count = structure.mode_count + self.more
+        table = [[values[f"mode{i}.{k}"] for k in kinds] for i in range(1, count + 1)]
         f1, _, r1, a1 = table[0]
 
         def part(row: list[float]) -> float:
             f, _, r, a = row
-            return (abs(r / (r1 or 1.0)) + abs(a / (a1 or 1.0))) / (abs((f / f1) ** 2 - 1) + 1e-9)
+            # of several, the drive near one frequency knows the speaker's shares together only
+            share = abs(r / (r1 or 1.0)) + (abs(a / (a1 or 1.0)) if self.more == 1 else 0.0)
+            return share / (abs((f / f1) ** 2 - 1) + 1e-9)
 
-        extra = min(range(1, len(table)), key=lambda i: part(table[i]))
-        declared = [row for i, row in enumerate(table) if i != extra]
+        extra = sorted(sorted(range(1, count), key=lambda i: part(table[i]))[: self.more])
+        rows = [row for i, row in enumerate(table) if i not in extra] + [table[i] for i in extra]
+        flat = [x for row in rows for x in row]
         rest = [values[q.name] for q in structure.base_parameters[4 * structure.mode_count :]]
-        return [*(x for row in declared for x in row), *rest, *table[extra]]
+        at = 4 * structure.mode_count
+        return [*flat[:at], *rest, *flat[at:]]
 
     def to_restated(self, structure: Structure, values: Mapping[str, float]) -> dict[str, float]:
-        last = structure.mode_count + 1
-        own = {f"mode{last}.{q.name.split('.')[1]}": values[q.name] for q in self.parameters}
+        first = structure.mode_count + 1
+        own = {}
+        for i in range(self.more):
+            for q, kind in zip(self._of(i), _mode_parameters(""), strict=True):
+                own[f"mode{first + i}.{kind.name.split('.')[1]}"] = values[q.name]
         return {**{q.name: values[q.name] for q in structure.base_parameters}, **own}
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
-        names = (x.name for x in self.parameters)
-        return [*modes, Mode(*(p[n] for n in names))]
+        more = [Mode(*(p[q.name] for q in self._of(i))) for i in range(self.more)]
+        return [*modes, *more]
+
+    def _of(self, i: int) -> tuple[Parameter, ...]:
+        """The four parameters of the further mode number `i`, from 0."""
+        return self.parameters[4 * i : 4 * i + 4]
+
+
+def _mode_parameters(which: str) -> tuple[Parameter, ...]:
+    return (
+        Parameter(f"acoustic_mode.frequency{which}_hz", "Hz", 5.0, 5e3, "positive"),
+        Parameter(f"acoustic_mode.damping{which}", "1", 5e-4, 0.5, "positive"),
+        Parameter(f"acoustic_mode.flame_residue{which}", "1/s"),
+        Parameter(f"acoustic_mode.speaker_residue{which}", "m/s²/V"),
+    )
 
 
 class SideResonator(Effect):
@@ -106,7 +135,7 @@ class SideResonator(Effect):
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
         """From one more mode: at its frequency the load takes the place of its residues, so that
         r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise; κ_i is taken to go as q_i."""
-        if not isinstance(other, AcousticMode):
+        if not isinstance(other, AcousticMode) or other.more > 1:
             return []
         f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
         s = 2j * np.pi * f
@@ -184,6 +213,7 @@ class NonlinearDamping(Effect):
 
 EFFECTS: tuple[Effect, ...] = (
     AcousticMode(),
+    AcousticMode("two_modes", 2),
     *(SideResonator(n) for n in (1, 2, 3)),
     NonlinearDamping("quadratic"),
     NonlinearDamping("quadratic_mode"),

@@ -72,6 +72,46 @@ class Saturation(Effect):
         return lambda w: n(w / dual.sqrt((w * inverse) ** 2 + 1.0))
 
 
+class SaturatingGain(Effect):
+    """The linear term alone saturates, N(w) − w + L g(w/L), beside the declared higher powers.
+
+    ``tanh_gain``: g = tanh; ``arctan_gain``: g = arctan.
+    """
+
+    name, location = "nonlinearity_shape", "nonlinearity"
+    parameters = (Parameter("nonlinearity_shape.inverse_level", "1/m", 0.0),)
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+        self.law = dual.tanh if form == "tanh_gain" else dual.arctan
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q / known.flame_input_amplitude,) for q in (0.2, 0.7, 2.0)]
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        inverse = p["nonlinearity_shape.inverse_level"]
+        return lambda w: n(w) - w + self.law(w * inverse) / inverse
+
+
+class QuadraticOdd(Effect):
+    """An odd term of second degree, b w|w|: the gain changes with the amplitude from the start."""
+
+    name, location, form = "nonlinearity_shape", "nonlinearity", "quadratic_odd"
+    parameters = (Parameter("nonlinearity_shape.bent", "m^-1"),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q / known.flame_input_amplitude,) for q in (-0.05, -0.5)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        bent = p["nonlinearity_shape.bent"]
+        if isinstance(n, Polynomial):
+            return n.bending(bent)
+        return lambda w: n(w) + w * dual.absolute(w) * bent
+
+
 class DeadZone(Effect):
     """Nothing passes within ±`width`; beyond it, what exceeds it does."""
 
@@ -175,6 +215,9 @@ EFFECTS: tuple[Effect, ...] = (
     HigherOrder((4, 5)),
     Saturation("tanh"),
     Saturation("algebraic"),
+    SaturatingGain("tanh_gain"),
+    SaturatingGain("arctan_gain"),
+    QuadraticOdd(),
     DeadZone(),
     SoftDeadZone(),
     Hysteresis(),

@@ -36,7 +36,8 @@ def with_leak(at: Conditions, y: Any, leak: Any) -> Any:
 
 
 class ChannelMismatch(Effect):
-    """The upper microphone reads g times the pressure: gain, sampling time, phase or a low-pass.
+    """The upper microphone reads g times the pressure: gain, sampling time, phase, low- or
+    high-pass.
 
     û_measured − û_true = −p̂₂ (1 − 1/g) / (ρ Δx s): common pressure leaks into the velocity.
     """
@@ -50,6 +51,7 @@ class ChannelMismatch(Effect):
         skew = Parameter("channel_mismatch.skew_s", "s", -1e-2, 1e-2, scale=1e-6)
         phase = Parameter("channel_mismatch.phase_rad", "rad", -1.0, 1.0, scale=1e-3)
         lag = Parameter("channel_mismatch.lowpass_time_s", "s", -1e-2, 1e-2, scale=1e-6)
+        corner = Parameter("channel_mismatch.highpass_hz", "Hz", -100.0, 100.0)
         self.parameters = {
             "gain": (gain,),
             "skew": (skew,),
@@ -57,6 +59,7 @@ class ChannelMismatch(Effect):
             "phase": (phase,),
             "gain_phase": (gain, phase),
             "lowpass": (lag,),
+            "highpass": (corner,),
         }[form]
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
@@ -75,6 +78,8 @@ class ChannelMismatch(Effect):
                 inverse = inverse * dual.exp(s * value)
             elif q.name.endswith("phase_rad"):
                 inverse = inverse * dual.exp(1j * value)
+            elif q.name.endswith("highpass_hz"):
+                inverse = inverse * (2 * np.pi * value / s + 1.0)
             else:
                 inverse = inverse * (s * value + 1.0)
         leak = upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
@@ -144,7 +149,7 @@ class ModalOffset(Effect):
         )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(q,) * len(self.parameters) for q in (0.98, 1.02, 0.85, 1.15)]
+        return [(q,) * len(self.parameters) for q in (0.98, 1.02, 0.8, 1.25, 0.6, 1.6)]
 
     def neutral(self) -> tuple[float, ...]:
         return (1.0,) * len(self.parameters)
@@ -179,6 +184,7 @@ EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("phase"),
     ChannelMismatch("gain_phase"),
     ChannelMismatch("lowpass"),
+    ChannelMismatch("highpass"),
     SensorOffset("propagation"),
     SensorOffset("mode_shapes"),
     ModalOffset(2),

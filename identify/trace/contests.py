@@ -225,6 +225,30 @@ def reformed(
     return out
 
 
+def at_the_same_place(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """Other effects at the location of the one that explains the data, from where it ended.
+
+    They are the likeliest to predict the same, and may have lost their way on coarse noise.
+    """
+    good = [t for t in tries if t.explains]
+    if not good:
+        return []
+    best = best_form(good)
+    done = {t.key_of_forms for t in tries if t.adequate}
+    items = [
+        (best, (), best.effects[0], e, data)
+        for e in available
+        if e.location == best.effects[0].location
+        and e.name != best.effects[0].name
+        and not e.refines
+        and (e.key,) not in done
+    ]
+    fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
+    return [tried(fit.structure.effects, fit, data) for fit in fits]
+
+
 def in_their_places(
     tries: Sequence[Tried],
     data: Dataset,

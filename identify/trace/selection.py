@@ -13,6 +13,7 @@ from identify.fit import Fit, fit_orbits
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
+    at_the_same_place,
     eliminate,
     in_other_forms,
     in_their_places,
@@ -23,12 +24,13 @@ from identify.trace.contests import (
 )
 from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
-from identify.trace.tried import Tried, best_by_name, best_form, misfit, tried
+from identify.trace.tried import BEATEN, Tried, best_by_name, best_form, misfit, tried
 
 Progress = Callable[[float, str], None]
 
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
+LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
 
@@ -78,10 +80,17 @@ def search(
     if not any(t.adequate for t in singles) and base.chi2_per_dof > GROSS:
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
+    if not any(t.explains for t in singles):
+        more = [e for e in available if e.refines and e.restated(structure) is not None]
+        singles += try_effects(
+            structure, data, base, more, executor=run, keep=1, far=False,
+            progress=lambda share, text: report(0.6, text),
+        )  # fmt: skip
     singles = [*singles, *in_other_forms(singles, data, available, run)]
+    singles += at_the_same_place(singles, data, available, run)
     singles += led_on(singles, data, run)
     everything = list(singles)
-    if not any(t.explains for t in everything):
+    if base.chi2_per_dof < LITTLE or not any(t.explains for t in everything):
         report(0.6, "trying run-to-run scatter")
         everything += try_scatters(structure, data, base, scatters, run)
     level = best_by_name(singles)
@@ -148,7 +157,7 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
     out = []
     for t in tries:
         if t.spread is not None and t.evidence > least:
-            spread = replace(t.spread, objection=t.spread.objection or "a law does better")
+            spread = replace(t.spread, objection=t.spread.objection or BEATEN)
             out.append(replace(t, spread=spread))
         else:
             out.append(t)

@@ -20,7 +20,9 @@ from identify.scatter import Spread
 from identify.structure import Effect
 
 ALPHA = 1e-3  # false-alarm probability of each significance test
+LEFT_P = 0.03  # chance below which what a spread leaves is more than noise
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
+BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 
 
@@ -53,8 +55,9 @@ class Tried:
 
     @property
     def explains(self) -> bool:
-        """Adequate, and with values that can be true."""
-        return self.adequate and self.plausible
+        """Adequate, and with values that can be true. A spread must leave nothing but noise: it
+        takes away so much of any law's misfit that little is left to betray one."""
+        return self.adequate and self.plausible and (self.spread is None or self.fit_p > LEFT_P)
 
     @property
     def evidence(self) -> float:
@@ -129,18 +132,29 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     """Adequate, plausible sets of other effects that the data do not rule out against `best`.
 
     What only adds an effect to one of them is none of its own. Among spreads the likelihood alone
-    decides: how well the wanderings of a few runs fit a Gaussian says little of their cause.
+    decides: how well the wanderings of a few runs fit a Gaussian says little of their cause. A law
+    may follow what chance did where a spread is about as likely, or likelier though it looks not
+    quite random.
     """
     found = [
         t
         for t in others
         if t.key != best.key
-        and (t.explains or (t.plausible and t.spread is not None and best.spread is not None))
+        and (t.explains or _chance_rivals(t, best))
         and t.evidence < best.evidence + EVIDENCE
         and not set(best.names) < set(t.names)
         and not _extends(t, best)
     ]
     return [t for t in found if not any(set(o.names) < set(t.names) for o in found)]
+
+
+def _chance_rivals(spread: Tried, best: Tried) -> bool:
+    if spread.spread is None:
+        return False
+    if best.spread is not None:
+        return spread.plausible
+    random = spread.spread.objection in ("", BEATEN)
+    return spread.adequate and spread.evidence < best.evidence + (EVIDENCE if random else 0.0)
 
 
 def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ...]]:
@@ -210,4 +224,7 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
 def _note(t: Tried) -> str:
     if not t.fit.converged:
         return t.fit.reason
-    return "" if t.spread is None else t.spread.objection
+    if t.spread is None:
+        return ""
+    left = "leaves more than noise" if t.adequate and not t.fit_p > LEFT_P else ""
+    return t.spread.objection or left

@@ -1,0 +1,243 @@
+"""Forms of effects that the simulated rig has no switch for: other hands would write them so."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from daq.importers import open_campaign
+from identify import dual, start, trace
+from identify.effects import by_key
+from identify.effects.scatter import SCATTERS
+from identify.executor import InProcess
+from identify.fit import Fit
+from identify.identification import Prepared, prepare
+from identify.load import load_campaign
+from identify.polynomial import Polynomial
+from identify.scatter import Spread, fit_scatter
+from identify.structure import Structure
+from identify.trace import selection
+from identify.trace.contests import at_the_same_place
+from identify.trace.selection import try_scatters
+from identify.trace.tried import BEATEN
+from simulated_rig import build_config
+from simulated_rig.campaigns import (
+    PlannedRun,
+    simulate_campaign,
+    simulate_run,
+    write_campaign,
+)
+from simulated_rig.config import RigConfig
+from simulated_rig.plant import Plant
+from simulated_rig.random_rigs import random_campaign
+from tests.test_identify_balance import forced_conditions
+from tests.trace_material import only, search_for, thesis_campaign
+
+pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
+
+S = 2j * np.pi * 170.0 * np.arange(1, 4)
+NOWHERE = forced_conditions()
+CHANGE = 0.05
+WALK = np.linspace(-1.5, 1.5, 25)[None, :]
+
+
+@lru_cache(maxsize=1)
+def planned() -> tuple[RigConfig, tuple[PlannedRun, ...]]:
+    return random_campaign(7, build_config(noise_db=36.0), (), forced=7, validation=2)
+
+
+def changing(folder: Path, change: Callable[[Plant, float], Plant]) -> Prepared:
+    """The thesis's rig, its plant changed by the share of the campaign that has gone by."""
+    rig, plan = planned()
+    last = max(run.started_s for run in plan)
+    runs = []
+    for i, run in enumerate(plan):
+        now = replace(rig, plant=change(rig.plant, run.started_s / last))
+        runs.append(simulate_run(now, run, [7, i], f"{i:02d}"))
+    made = simulate_campaign(rig, plan[:1], 7, declared_modes=2)
+    write_campaign(replace(made, runs=tuple(runs)), folder)
+    return prepare(load_campaign(open_campaign(folder)))
+
+
+def first_damping(plant: Plant, t: float) -> Plant:
+    first, *others = plant.modes
+    return replace(plant, modes=(replace(first, damping=first.damping * (1 + CHANGE * t)), *others))
+
+
+def flame_input(plant: Plant, t: float) -> Plant:
+    flame = plant.flame
+    return replace(plant, flame=replace(flame, gain=flame.gain * (1 + CHANGE * t)))
+
+
+def flame_rate(plant: Plant, t: float) -> Plant:
+    flame = plant.flame
+    return replace(plant, flame=replace(flame, pole_hz=flame.pole_hz * (1 + CHANGE * t)))
+
+
+def settling(plant: Plant, t: float) -> Plant:
+    factor = 1 + 0.1 * CHANGE * (1 - np.exp(-t / 0.3))
+    modes = tuple(replace(m, frequency_hz=m.frequency_hz * factor) for m in plant.modes)
+    return replace(plant, modes=modes)
+
+
+@pytest.mark.parametrize(
+    ("form", "near", "change", "truth"),
+    [
+        ("first_damping", "damping", first_damping, {"relative_change": CHANGE}),
+        ("flame_input", "flame_gain", flame_input, {"relative_change": CHANGE}),
+        ("flame_rate", "flame_pole", flame_rate, {"relative_change": CHANGE}),
+        (
+            "frequency_settling",
+            "frequency_curve",
+            settling,
+            {"relative_change": 0.1 * CHANGE, "settling_time": 0.3},
+        ),
+    ],
+)
+def test_drifts_of_one_thing_alone(
+    tmp_path: Path,
+    form: str,
+    near: str,
+    change: Callable[[Plant, float], Plant],
+    truth: dict[str, float],
+) -> None:
+    ready = changing(tmp_path, change)
+    best, rivals = search_for(ready, *(f"parameter_drift:{f}" for f in (form, near)))
+    assert ([e.form for e in best.effects], rivals) == ([form], [])
+    for name, value in truth.items():
+        found = best.estimates[f"parameter_drift.{name}"]
+        assert abs(found.value - value) < 4 * found.stderr
+
+
+def test_a_spread_must_leave_nothing_but_noise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It takes away so much of any law that what it leaves betrays one before it would a law."""
+    size = {"gain_rms": 0.004, "phase_rms_rad": 0.004}
+    ready = thesis_campaign(tmp_path, 7, {"drive_scatter": size})
+    base = start.fit_from_data(ready.structure, ready.data)
+    (drive,) = [s for s in SCATTERS if s.name == "drive_scatter"]
+    real = fit_scatter(ready.structure, ready.data, base, drive)
+    assert real is not None
+    for p_value, explains in ((0.01, False), (0.1, True)):
+        chi2 = float(stats.chi2.isf(p_value, real.fit.dof))
+        lacking = replace(real, fit=replace(real.fit, chi2=chi2), objection="")
+        monkeypatch.setattr(selection, "fit_scatter", lambda *_, given=lacking: given)
+        (found,) = try_scatters(ready.structure, ready.data, base, [drive], InProcess())
+        assert found.adequate
+        assert found.explains is explains
+
+
+def test_two_further_modes(tmp_path: Path) -> None:
+    """The thesis's four modes, two of them declared: one more does not explain the rest."""
+    rig, plan = random_campaign(
+        7, build_config("thesis-four-mode", noise_db=36.0), (), forced=7, validation=2
+    )
+    write_campaign(simulate_campaign(rig, plan, 7, declared_modes=2), tmp_path)
+    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert not only(ready, base, "acoustic_mode:mode").adequate
+    best = only(ready, base, "acoustic_mode:two_modes")
+    assert best.explains
+    for name, hz in (("frequency_hz", 393.86), ("frequency2_hz", 506.39)):
+        found = best.estimates[f"acoustic_mode.{name}"]
+        assert abs(found.value - hz) < 4 * found.stderr < 10.0
+
+
+def test_other_effects_at_the_same_place_start_from_where_one_explains(tmp_path: Path) -> None:
+    """A lag and a short delay of the flame predict nearly the same; a speaker's lag stands
+    elsewhere."""
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 1e-4}})
+    base = start.fit_from_data(ready.structure, ready.data)
+    delay = only(ready, base, "flame_delay")
+    assert delay.explains
+    keys = ("flame_dynamics:pole", "actuator_dynamics:pole", "flame_delay")
+    others = [by_key(k) for k in keys]
+    (lag,) = at_the_same_place([delay], ready.data, others, InProcess())
+    assert lag.key_of_forms == ("flame_dynamics:pole",)
+    assert lag.fit.converged
+    assert lag.fit.chi2 < 0.2 * base.chi2
+    lost = replace(delay, fit_p=0.0)  # where nothing explains, there is nowhere to start from
+    assert at_the_same_place([lost], ready.data, others, InProcess()) == []
+
+
+def spread_of(evidence: float, objection: str) -> trace.Tried:
+    """A drive that scatters, of that χ² + p ln n and objection."""
+    one, none = np.zeros(100), np.zeros((0, 0))
+    fit = Fit(Structure(2), np.zeros(0), 0.0, 100, none, one, none, True, "", 1)
+    (drive,) = [s for s in SCATTERS if s.name == "drive_scatter"]
+    sizes = 2 * float(np.log(100))
+    spread = Spread(fit, None, dict.fromkeys("ab"), evidence - sizes, objection)  # type: ignore[arg-type]
+    return trace.Tried((drive,), fit, 1e-3, 0.5, 0.5, spread)
+
+
+@pytest.mark.parametrize(
+    ("excess", "objection", "rival"),
+    [
+        (5.0, BEATEN, True),  # about as likely, and random
+        (15.0, BEATEN, False),
+        (5.0, "gain_rms follows the drive", False),
+        (-1.0, "gain_rms follows the drive", True),  # likelier, whatever speaks against it
+    ],
+)
+def test_a_law_may_follow_what_chance_did(excess: float, objection: str, rival: bool) -> None:
+    none = np.zeros((0, 0))
+    fit = Fit(Structure(2), np.zeros(0), 100.0, 100, none, np.zeros(100), none, True, "", 1)
+    law = trace.Tried((by_key("acoustic_mode:mode"),), fit, 1e-3, 0.5, 0.5)
+    chance = spread_of(law.evidence + excess, objection)
+    assert (trace.rivals(law, [law, chance]) == [chance]) is rival
+
+
+@pytest.mark.parametrize("form", ["tanh_gain", "arctan_gain", "quadratic_odd"])
+def test_characteristics_and_their_derivatives(form: str) -> None:
+    effect = by_key(f"nonlinearity_shape:{form}")
+    (own,) = effect.parameters
+    declared = Polynomial((1.0, 0.3, -0.2))
+
+    def value(x: Any, size: Any) -> Any:
+        return effect.characteristic({own.name: size}, declared, NOWHERE)(x)
+
+    linear = {"tanh_gain": np.tanh(0.7 * WALK) / 0.7, "arctan_gain": np.arctan(0.7 * WALK) / 0.7}
+    more = linear[form] - WALK if form in linear else 0.7 * WALK * np.abs(WALK)
+    np.testing.assert_allclose(value(WALK, 0.7), declared(WALK) + more, atol=1e-14)
+    seeds = np.eye(2)
+    x = dual.Dual(WALK, np.broadcast_to(seeds[0], (*WALK.shape, 2)))
+    size = dual.Dual(np.array([[0.7]]), seeds[1][None, None, :])
+    slopes = value(x, size).d
+    h = 1e-6
+    by_x = (value(WALK + h, 0.7) - value(WALK - h, 0.7)) / (2 * h)
+    by_size = (value(WALK, 0.7 + h) - value(WALK, 0.7 - h)) / (2 * h)
+    np.testing.assert_allclose(slopes, np.stack([by_x, by_size], axis=-1), atol=1e-6)
+
+
+def test_linear_forms_are_what_they_say() -> None:
+    lead = {"flame_dynamics.share": -2.75, "flame_dynamics.time_s": 5e-5}
+    response = by_key("flame_dynamics:second_time_scale").flame(lead, NOWHERE, S)
+    np.testing.assert_allclose(response, (1 + S * 3.75 * 5e-5) / (1 + S * 5e-5))
+    plenum = {"frequency_hz": 180.0, "damping": 0.5, "time_s": 3e-4}
+    values = {f"actuator_dynamics.{k}": v for k, v in plenum.items()}
+    alone = by_key("actuator_dynamics:resonance").actuator(values, NOWHERE, S)
+    both = by_key("actuator_dynamics:resonance_pole").actuator(values, NOWHERE, S)
+    np.testing.assert_allclose(both, alone / (1 + 3e-4 * S))
+
+
+def test_an_amplifier_s_crossover() -> None:
+    """Its derivative by the level against differences; far above the level it only loses 4/π w."""
+    effect = by_key("actuator_nonlinearity:crossover")
+    u = np.zeros((1, 5), dtype=complex)
+    u[0, 0] = -2j
+    at = replace(NOWHERE, drive=u)
+
+    def drive(level: Any) -> Any:
+        return effect.drive({"actuator_nonlinearity.level_v": level}, at, u)
+
+    small = drive(1e-3)
+    assert abs(small[0, 0]) == pytest.approx(2 - 4 / np.pi * 1e-3, rel=1e-6)
+    seeded = drive(dual.Dual(np.array([[0.1]]), np.ones((1, 1, 1))))
+    difference = (drive(0.101) - drive(0.099)) / 2e-3
+    np.testing.assert_allclose(seeded.d[..., 0], difference, atol=2e-3)
