@@ -363,10 +363,29 @@ def _again(item: tuple[Tried, Dataset]) -> Fit:
     rough = data.coarse()
     clean = corrected(data, t.effects, values)
     exact = [] if clean is None else [np.r_[theta, own] for theta in candidates(plain, clean)]
+    exact += [] if clean is None else _restated_starts(t, clean)
     starts = coarse(larger, rough, exact)[:5] + physical_starts(larger, rough, [row])[:5]
     polished = polish(larger, rough, starts, shares=(0.05, 0.01), iterations=10)[:3]
     thetas = np.stack([*(s.theta for s in polished), t.fit.theta])
     return fit_orbits(larger, data, thetas, continuation=(0.003, 0.0), iterations=100)
+
+
+def _restated_starts(t: Tried, clean: Dataset) -> list[FloatArray]:
+    """Starts of `t`, of several effects, from the richer structure that says the same as one of
+    them, on data corrected for the others."""
+    larger, plain = t.fit.structure, replace(t.fit.structure, effects=())
+    for effect in t.effects:
+        richer = effect.restated(plain)
+        if richer is None or len(t.effects) == 1:
+            continue
+        out = []
+        for theta in candidates(richer, clean):
+            own = effect.from_restated(plain, richer.parameters.plain(theta))
+            names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
+            values = {**t.fit.values, **dict(zip(names, own, strict=True))}
+            out.append(larger.parameters.to_internal([values[n] for n in larger.parameters.names]))
+        return out
+    return []
 
 
 def _best(
