@@ -81,11 +81,13 @@ def search(
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
     if not any(t.explains for t in singles):
-        more = [e for e in available if e.refines and e.restated(structure) is not None]
-        singles += try_effects(
-            structure, data, base, more, executor=run, keep=1, far=False,
+        richer = [e for e in available if e.refines and e.restated(structure) is not None]
+        found = try_effects(
+            structure, data, base, richer, executor=run, keep=1, far=False,
             progress=lambda share, text: report(0.6, text),
         )  # fmt: skip
+        # of so many parameters that, beside another effect, they would stand for it
+        singles += [t for t in found if t.explains]
     singles = [*singles, *in_other_forms(singles, data, available, run)]
     singles += at_the_same_place(singles, data, available, run)
     singles += led_on(singles, data, run)
