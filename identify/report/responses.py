@@ -17,13 +17,12 @@ from identify.dual import Dual
 from identify.fit import Fit
 from identify.results import Assessment
 from identify.statespace import linear_poles, standing_still
-from identify.structure import Conditions, Loop
+from identify.structure import Conditions, Effect, Loop
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
 
 SAMPLES = 64  # a period of the describing function: exact for polynomials below degree 63
-SMALL_V = 1e-9  # drive at which an actuator's nonlinearity does not yet act
 
 
 @dataclass(frozen=True)
@@ -155,12 +154,14 @@ def largest_input(a: Assessment) -> float:
 def _seeded(fit: Fit, s: ComplexArray) -> tuple[Loop, Conditions]:
     at = _at(s)
     values = fit.structure.parameters.seeded(fit.theta[None], s.shape[0])
-    return fit.structure.assemble(values, at, s), at
+    # the acoustics are asked for: a distortion of the drive stands before them
+    effects = tuple(e for e in fit.structure.effects if type(e).drive is Effect.drive)
+    return replace(fit.structure, effects=effects).assemble(values, at, s), at
 
 
 def _at(s: ComplexArray) -> Conditions:
     still = standing_still(s.shape[0])
-    return replace(still, omega=s[:, 0].imag, drive=np.full(s.shape, SMALL_V, dtype=complex))
+    return replace(still, omega=s[:, 0].imag, drive=np.ones(s.shape, dtype=complex))
 
 
 def _slope(loop: Loop, rows: int) -> Any:
