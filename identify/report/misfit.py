@@ -96,7 +96,10 @@ def residual_trends(before: Assessment, after: Assessment | None) -> Figure:
     )
     for label, a, colour in models:
         runs, sizes = in_noise_units(a)
-        rms = np.sqrt(np.nanmean(sizes**2, axis=1))
+        seen = np.count_nonzero(np.isfinite(sizes), axis=1)
+        # where the model has no state for a run, there is nothing to draw
+        power = np.where(seen > 0, np.nansum(sizes**2, axis=1) / np.maximum(seen, 1), np.nan)
+        rms = np.sqrt(power)
         for ax, _, position in panels:
             _scatter(ax, [position(c) for c in runs], rms, runs, colour, label)
         _by_parity(axes[1, 1], sizes, colour, label)
