@@ -264,11 +264,12 @@ def _course(name: str, change: float, first: bool = False, settles: float = 0.0)
         factor = 1 + change * ((1 - np.exp(-t / settles)) if settles else t)
         value = getattr(tube, name)
         if isinstance(value, float):
-            scaled: dict[str, Any] = {name: value * factor}
-            return replace(tube, **scaled)
-        moved = [x * factor if i == 0 or not first else x for i, x in enumerate(value)]
-        change_to: dict[str, Any] = {name: tuple(moved)}
-        return replace(tube, **change_to)
+            value *= factor
+        else:
+            kept = 1 if first else len(value)
+            value = (*(x * factor for x in value[:kept]), *value[kept:])
+        moved: dict[str, Any] = {name: value}
+        return replace(tube, **moved)
 
     return now
 

@@ -19,7 +19,7 @@ from identify.load import load_campaign
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import fit_scatter
-from identify.structure import Conditions, Structure
+from identify.structure import Conditions
 from identify.trace.contests import in_other_forms
 from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import scan
@@ -29,7 +29,15 @@ from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import EFFECTS, make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
-from tests.trace_material import campaign, only, recorded, search_for, thesis_campaign
+from tests.trace_material import (
+    campaign,
+    fitted,
+    only,
+    recorded,
+    search_for,
+    thesis_campaign,
+    tried_as,
+)
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -357,19 +365,6 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     assert excess[1] < 0.4 * excess[0]
     assert found.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(231.0, abs=3.0)
     assert mode.fit.values["acoustic_mode.frequency_hz"] < 225.0
-
-
-def fitted(parameters: int, chi2_per_dof: float) -> Fit:
-    """A fit of 119 residuals of which only this is looked at."""
-    dof, p = 119 - parameters, parameters
-    none, rest = np.zeros((p, p)), np.zeros(119)
-    chi2 = dof * chi2_per_dof
-    return Fit(Structure(2), np.zeros(p), chi2, dof, none, rest, none, True, "", 1)
-
-
-def tried_as(fit: Fit, *keys: str) -> trace.Tried:
-    """A set of effects with that fit, adequate on both kinds of runs."""
-    return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)
 
 
 @pytest.mark.parametrize(

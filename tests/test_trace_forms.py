@@ -15,12 +15,10 @@ from identify import dual, start, trace
 from identify.effects import by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.scatter import Spread, fit_scatter
-from identify.structure import Structure
 from identify.trace import selection
 from identify.trace.contests import at_the_same_place
 from identify.trace.selection import try_scatters
@@ -36,7 +34,7 @@ from simulated_rig.config import RigConfig
 from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign
 from tests.test_identify_balance import forced_conditions
-from tests.trace_material import only, search_for, thesis_campaign
+from tests.trace_material import fitted, only, search_for, thesis_campaign, tried_as
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -135,11 +133,7 @@ def test_a_spread_must_leave_nothing_but_noise(
 
 def test_two_further_modes(tmp_path: Path) -> None:
     """The thesis's four modes, two of them declared: one more does not explain the rest."""
-    rig, plan = random_campaign(
-        7, build_config("thesis-four-mode", noise_db=36.0), (), forced=7, validation=2
-    )
-    write_campaign(simulate_campaign(rig, plan, 7, declared_modes=2), tmp_path)
-    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    ready = thesis_campaign(tmp_path, 7, {}, preset="thesis-four-mode")
     base = start.fit_from_data(ready.structure, ready.data)
     assert not only(ready, base, "acoustic_mode:mode").adequate
     best = only(ready, base, "acoustic_mode:two_modes")
@@ -168,10 +162,9 @@ def test_other_effects_at_the_same_place_start_from_where_one_explains(tmp_path:
 
 def spread_of(evidence: float, objection: str) -> trace.Tried:
     """A drive that scatters, of that χ² + p ln n and objection."""
-    one, none = np.zeros(100), np.zeros((0, 0))
-    fit = Fit(Structure(2), np.zeros(0), 0.0, 100, none, one, none, True, "", 1)
+    fit = fitted(0, 0.0)
     (drive,) = [s for s in SCATTERS if s.name == "drive_scatter"]
-    sizes = 2 * float(np.log(100))
+    sizes = 2 * float(np.log(fit.residual.size))
     spread = Spread(fit, None, dict.fromkeys("ab"), evidence - sizes, objection)  # type: ignore[arg-type]
     return trace.Tried((drive,), fit, 1e-3, 0.5, 0.5, spread)
 
@@ -186,9 +179,7 @@ def spread_of(evidence: float, objection: str) -> trace.Tried:
     ],
 )
 def test_a_law_may_follow_what_chance_did(excess: float, objection: str, rival: bool) -> None:
-    none = np.zeros((0, 0))
-    fit = Fit(Structure(2), np.zeros(0), 100.0, 100, none, np.zeros(100), none, True, "", 1)
-    law = trace.Tried((by_key("acoustic_mode:mode"),), fit, 1e-3, 0.5, 0.5)
+    law = tried_as(fitted(0, 1.0), "acoustic_mode:mode")
     chance = spread_of(law.evidence + excess, objection)
     assert (trace.rivals(law, [law, chance]) == [chance]) is rival
 

@@ -4,6 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from daq.importers import open_campaign
 from identify import start, trace
 from identify.effects import by_key
@@ -12,6 +14,7 @@ from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.record import Campaign
+from identify.structure import Structure
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import make_effect
@@ -56,11 +59,12 @@ def thesis_campaign(
     effects: Mapping[str, dict[str, float]] | Sequence[tuple[str, dict[str, float]]],
     noise_db: float = 36.0,
     validation: int = 2,
+    preset: str = "thesis-two-mode",
 ) -> Prepared:
-    """The thesis's rig with these effects, recorded and prepared."""
+    """The thesis's rig with these effects, recorded and prepared; two modes are declared."""
     pairs = effects.items() if isinstance(effects, Mapping) else effects
     made = [make_effect(key, parameters) for key, parameters in pairs]
-    rig = build_config(noise_db=noise_db)
+    rig = build_config(preset, noise_db=noise_db)
     rig, plan = random_campaign(seed, rig, made, forced=7, validation=validation)
     write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
     return prepare(load_campaign(open_campaign(folder)))
@@ -72,3 +76,16 @@ def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tri
     found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
     best = trace.best_form([t for t in found.tried if t.explains])
     return best, trace.rivals(best, trace.best_by_name(found.tried))
+
+
+def fitted(parameters: int, chi2_per_dof: float) -> Fit:
+    """A fit of 119 residuals of which only this is looked at."""
+    dof, p = 119 - parameters, parameters
+    none, rest = np.zeros((p, p)), np.zeros(119)
+    chi2 = dof * chi2_per_dof
+    return Fit(Structure(2), np.zeros(p), chi2, dof, none, rest, none, True, "", 1)
+
+
+def tried_as(fit: Fit, *keys: str) -> trace.Tried:
+    """A set of effects with that fit, adequate on both kinds of runs."""
+    return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)

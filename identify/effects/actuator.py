@@ -64,14 +64,11 @@ class LaggingResonance(Effect):
     """A second-order speaker behind a first-order lag: its resonance and its coil, or a plenum."""
 
     name, location, form = "actuator_dynamics", "actuator", "resonance_pole"
-    parameters = (
-        *SpeakerResonance("resonance").parameters,
-        Parameter("actuator_dynamics.time_s", "s", 0.0, 0.1, scale=1e-4),
-    )
+    resonance, lag = SpeakerResonance("resonance"), VoiceCoil()
+    parameters = (*resonance.parameters, *lag.parameters)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        lag = 0.03 / known.free_hz
-        return [(*row, lag) for row in SpeakerResonance("resonance").starts(known)]
+        return [(*row, *self.lag.starts(known)[0]) for row in self.resonance.starts(known)]
 
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
         if other.form != "resonance":
@@ -80,8 +77,7 @@ class LaggingResonance(Effect):
         return [(f, z, 0.0), (f, z, 0.1 / f)]
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
-        lag = s * p["actuator_dynamics.time_s"] + 1.0
-        return SpeakerResonance("resonance").actuator(p, at, s) / lag
+        return self.resonance.actuator(p, at, s) * self.lag.actuator(p, at, s)
 
 
 class ActuatorDelay(Effect):
@@ -178,12 +174,7 @@ class Crossover(Effect):
         return [(share * known.drive_amplitude,) for share in (0.005, 0.03, 0.1)]
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        forth, back = _finely(at.harmonics)
-        level = p["actuator_nonlinearity.level_v"]
-        wave = np.concatenate([u.real, u.imag], axis=1) @ forth
-        side = np.sign(wave) * (np.abs(wave) > dual.value(level))
-        passed = wave * np.abs(side) - dual.value(level) * side
-        return dual.chain(passed @ back, (-(side @ back), level))
+        return HardClipping().drive(p, at, u) * -1.0 + u  # what a clipped wave has lost
 
 
 class Knee(Effect):

@@ -7,6 +7,8 @@ from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
+FIRST = {"first_mode": "frequency", "first_damping": "damping"}  # what changes of mode 1 alone
+
 
 def course(at: Conditions, change: Any, curvature: Any = None) -> Any:
     """Factor on a parameter, one row a run: 1 at the campaign's start, 1 + change at its end, a
@@ -27,10 +29,8 @@ def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
     """The modes with one thing of theirs multiplied."""
     if what == "frequency":
         return [replace(m, frequency_hz=m.frequency_hz * factor) for m in modes]
-    if what == "first_mode":
-        return [replace(modes[0], frequency_hz=modes[0].frequency_hz * factor), *modes[1:]]
-    if what == "first_damping":
-        return [replace(modes[0], damping=modes[0].damping * factor), *modes[1:]]
+    if what in FIRST:
+        return [*changed(modes[:1], FIRST[what], factor), *modes[1:]]
     if what == "flame_gain":
         return [replace(m, flame_residue=m.flame_residue * factor) for m in modes]
     if what == "damping":
@@ -112,11 +112,12 @@ class SeveralDrifts(Effect):
         return modes
 
 
-class FlamePoleDrift(Effect):
-    """The flame's time scale changes over the campaign: a factor on the first pole.
+class FlameDrift(Effect):
+    """The flame's linear answer to the velocity changes over the campaign.
 
-    ``flame_pole``: its answer to slow changes stays, ω/(s + ω); ``flame_rate``: that to fast ones
-    does, 1/(s + ω).
+    A factor on its first pole: ``flame_pole``, where its answer to slow changes stays, ω/(s + ω);
+    ``flame_rate``, where that to fast ones does, 1/(s + ω). Or ``flame_input``, on its gain before
+    the characteristic, and so on the amplitude at which it saturates.
     """
 
     name, location = "parameter_drift", "experiment"
@@ -132,27 +133,13 @@ class FlamePoleDrift(Effect):
         return (0.0,)
 
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        factor = course(at, p["parameter_drift.relative_change"])
+        if self.form == "flame_input":
+            return factor + 0.0 * s
         pole = 2 * 3.141592653589793 * p["flame.pole_hz"]
-        moved = pole * (p["parameter_drift.relative_change"] * at.time[:, None] + 1.0)
+        moved = pole * factor
         kept = moved / pole if self.form == "flame_pole" else 1.0
         return (s + pole) / (s + moved) * kept
-
-
-class FlameInputDrift(Effect):
-    """The flame's answer to the velocity changes over the campaign before its characteristic: the
-    linear gain, and with it the amplitude at which it saturates."""
-
-    name, location, form = "parameter_drift", "experiment", "flame_input"
-    parameters = (Parameter("parameter_drift.relative_change", "1", -0.8, 0.8, scale=1e-2),)
-
-    def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(0.01,), (-0.01,)]
-
-    def neutral(self) -> tuple[float, ...]:
-        return (0.0,)
-
-    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
-        return course(at, p["parameter_drift.relative_change"]) + 0.0 * s
 
 
 EFFECTS: tuple[Effect, ...] = (
@@ -166,8 +153,8 @@ EFFECTS: tuple[Effect, ...] = (
     Drift("frequency_settling"),
     Drift("flame_gain_curve"),
     Drift("flame_gain_settling"),
-    FlameInputDrift(),
-    FlamePoleDrift("flame_pole"),
-    FlamePoleDrift("flame_rate"),
+    FlameDrift("flame_input"),
+    FlameDrift("flame_pole"),
+    FlameDrift("flame_rate"),
     SeveralDrifts(),
 )

@@ -212,9 +212,7 @@ def _canonical(fit: Fit, data: Dataset) -> Fit:
         if not fit.converged or effect.restated(plain) is None:
             continue
         named = effect.from_restated(plain, effect.to_restated(plain, fit.values))
-        names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
-        values = {**fit.values, **dict(zip(names, named, strict=True))}
-        theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+        theta = _with_named(fit, effect, named)
         if np.allclose(theta, fit.theta, rtol=1e-9, atol=1e-12):
             continue
         renamed = fit_orbits(structure, data, theta, continuation=(0.0,))
@@ -222,6 +220,15 @@ def _canonical(fit: Fit, data: Dataset) -> Fit:
         if renamed.converged and renamed.chi2 < fit.chi2 + 1.0:
             fit = renamed
     return fit
+
+
+def _with_named(fit: Fit, effect: Effect, values: Sequence[float]) -> FloatArray:
+    """Unknowns of `fit` with these values of the declared model and of one effect, in order."""
+    plain = replace(fit.structure, effects=())
+    names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
+    now = {**fit.values, **dict(zip(names, values, strict=True))}
+    parameters = fit.structure.parameters
+    return parameters.to_internal([now[n] for n in parameters.names])
 
 
 def shares_of(base: Fit, data: Dataset) -> tuple[float, float, float]:
@@ -373,18 +380,14 @@ def _again(item: tuple[Tried, Dataset]) -> Fit:
 def _restated_starts(t: Tried, clean: Dataset) -> list[FloatArray]:
     """Starts of `t`, of several effects, from the richer structure that says the same as one of
     them, on data corrected for the others."""
-    larger, plain = t.fit.structure, replace(t.fit.structure, effects=())
+    if len(t.effects) == 1:
+        return []
+    plain = replace(t.fit.structure, effects=())
     for effect in t.effects:
         richer = effect.restated(plain)
-        if richer is None or len(t.effects) == 1:
-            continue
-        out = []
-        for theta in candidates(richer, clean):
-            own = effect.from_restated(plain, richer.parameters.plain(theta))
-            names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
-            values = {**t.fit.values, **dict(zip(names, own, strict=True))}
-            out.append(larger.parameters.to_internal([values[n] for n in larger.parameters.names]))
-        return out
+        if richer is not None:
+            found = [richer.parameters.plain(theta) for theta in candidates(richer, clean)]
+            return [_with_named(t.fit, effect, effect.from_restated(plain, p)) for p in found]
     return []
 
 
