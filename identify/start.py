@@ -18,6 +18,7 @@ an answer. Low-discrepancy guesses of the poles stand by where it leads nowhere.
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
@@ -272,7 +273,8 @@ def _near(structure: Structure, a: FloatArray, b: FloatArray) -> bool:
 
 def corrected(data: Dataset, effects: Sequence[Effect], p: Values) -> Dataset | None:
     """The data as they would be without `effects` of assumed values `p`, as far as these stand
-    between the recorded drive and the sound, or between the velocity and its measurement.
+    between the recorded drive and the sound, or between the velocity and its measurement. What
+    effects form from measured signals is in the measurement's own phase, in free runs too.
 
     None where the values are so extreme that nothing finite is left.
     """
@@ -280,10 +282,11 @@ def corrected(data: Dataset, effects: Sequence[Effect], p: Values) -> Dataset | 
     def clean(b: Batch) -> Batch:
         s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
         drive, y = b.at.drive, b.at.velocity
+        given = replace(b.at, free=np.zeros_like(b.at.free))
         for e in effects:
             drive = e.actuator(p, b.at, s) * e.drive(p, b.at, drive)
-            none = e.sensor(p, b.at, s, np.zeros_like(y))
-            y = (y - none) / (e.sensor(p, b.at, s, np.ones_like(y)) - none)
+            none = e.sensor(p, given, s, np.zeros_like(y))
+            y = (y - none) / (e.sensor(p, given, s, np.ones_like(y)) - none)
         at = replace(b.at, drive=np.broadcast_to(drive, y.shape), velocity=y)
         return replace(b, at=at, measured=y[:, : b.compared])
 
@@ -372,6 +375,35 @@ def physical_starts(
     for row in effect_values:
         thetas += _slow_flow_thetas(structure, data, row, placements)
     return coarse(structure, data, thetas)
+
+
+def signed_starts(
+    structure: Structure,
+    data: Dataset,
+    effect_values: Sequence[Sequence[float]] = ((),),
+    placements: Sequence[tuple[float, ...]] | None = None,
+) -> list[CoarseStart]:
+    """The same with a fifth of mode 1's flame residue, of either sign, in each of the other modes:
+    for each row, placement and signs the best, best first.
+
+    A residue does not come through zero on its way down a misfit that it is not alone to blame for.
+    """
+    index, n = structure.parameters.index, structure.mode_count
+    residues = [index[f"mode{i}.flame_residue"] for i in range(2, n + 1)]
+    others = [index[f"mode{i}.frequency_hz"] for i in range(2, n + 1)]
+    own = [index[q.name] for e in structure.effects for q in e.parameters]
+    thetas = []
+    for row in effect_values:
+        for theta in _slow_flow_thetas(structure, data, row, placements):
+            for signs in product((1.0, -1.0), repeat=n - 1):
+                signed = theta.copy()
+                signed[residues] *= 4 * np.array(signs)
+                thetas.append(signed)
+    best: dict[bytes, CoarseStart] = {}
+    for found in coarse(structure, data, thetas):
+        kind = np.r_[found.theta[[*others, *own]], np.sign(found.theta[residues])]
+        best.setdefault(kind.tobytes(), found)
+    return list(best.values())
 
 
 def _slow_flow_thetas(
@@ -471,7 +503,7 @@ def _placements(count: int) -> list[tuple[float, ...]]:
     ]
 
 
-def _dense_placements(count: int) -> list[tuple[float, ...]]:
+def dense_placements(count: int) -> list[tuple[float, ...]]:
     """The same a tenth apart, every pair of two, further ones regularly above."""
     grid = [1.35 * 1.11**j for j in range(10)]
     if count == 1:
@@ -581,7 +613,7 @@ def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) ->
     at the wrong place is a local minimum in its own right, from which no descent comes back. What
     such a fit says of the singing mode, flame and nonlinearity is good all the same.
     """
-    dense = _dense_placements(structure.mode_count - 1)
+    dense = dense_placements(structure.mode_count - 1)
     thetas = _slow_flow_thetas(structure, rough, (), dense)
     for placement in dense:
         thetas += _moved(structure, near, data.free_hz, placement)

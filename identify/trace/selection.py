@@ -22,6 +22,7 @@ from identify.trace.contests import (
     settled,
     with_fewer,
 )
+from identify.trace.pairs import pairs_from_afar
 from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
 from identify.trace.tried import BEATEN, Tried, best_by_name, best_form, misfit, tried
@@ -98,6 +99,25 @@ def search(
     level = best_by_name(singles)
     extended: set[tuple[str, ...]] = {()}
     done: set[tuple[str, ...]] = set()
+
+    def from_afar() -> list[Tried]:
+        if depth < 2 or any(t.explains for t in everything):
+            return []
+        pairs = pairs_from_afar(
+            structure, data, base, apart, singles, run,
+            lambda share, text: report(0.6 + 0.3 * share, text),
+        )  # fmt: skip
+        return [eliminate(t, data) if t.explains else t for t in led_to_the_end(pairs)]
+
+    def led_to_the_end(grown: list[Tried]) -> list[Tried]:
+        grown = [*grown, *led_on(grown, data, run)]
+        if not any(t.explains for t in grown):
+            report(0.6, "trying other forms of the best")
+            grown += reformed(grown, data, available, run, done)
+        return grown
+
+    if level and level[0].fit.chi2_per_dof > GROSS:  # no single is a place to grow from
+        everything += from_afar()
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in everything if t.explains]
@@ -117,10 +137,7 @@ def search(
         far = base.chi2_per_dof > GROSS and not explaining
         if far and not any(t.adequate for t in grown):
             grown = started_again(grown, data, run)
-        grown += led_on(grown, data, run)
-        if not any(t.explains for t in grown):
-            report(0.6, "trying other forms of the best")
-            grown += reformed(grown, data, available, run, done)
+        grown = led_to_the_end(grown)
         level = best_by_name(grown)
         # what leaves a misfit is no better for having less in it; the best are shown without
         for t in grown:

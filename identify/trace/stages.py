@@ -282,7 +282,7 @@ def try_effects(
     if near:
         out += _refits(staged, out, data, executor, keep, progress)
     if far and not (near and any(t.adequate for t in out)):  # it may have been too flexible
-        placements = _likely_placements(replace(structure, effects=()), rough)
+        placements = likely_placements(replace(structure, effects=()), rough)
         tasks = [replace(t, placements=placements) for t in tasks]
         for i, starts in enumerate(executor.map(_from_afar, tasks)):
             both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
@@ -416,7 +416,7 @@ def _heats(
     return [*firsts, *others[: max(keep - len(firsts), 0)]]
 
 
-def _likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float, ...], ...]:
+def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float, ...], ...]:
     """Positions of the other modes (over the free frequency) of the best coarse starts."""
     if structure.mode_count == 1:
         return ((),)

@@ -1,0 +1,182 @@
+"""Two effects sought at once, for where both are gross.
+
+A search that adds one effect at a time starts from the best single, and a second gross effect has
+led that one astray. So every pair of names, each in the few forms that stand for the others, is led
+through coarse noise from the slow flow corrected for both of them; one more mode as one more
+declared mode. What comes nearest is led on, and the best few are refitted.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, product
+
+import numpy as np
+import numpy.typing as npt
+
+from identify.dataset import Dataset
+from identify.executor import Executor
+from identify.fit import Fit, fit_orbits
+from identify.start import CoarseStart, dense_placements, polish, signed_starts
+from identify.structure import Effect, Known, Structure
+from identify.trace.stages import known_sizes, likely_placements
+from identify.trace.tried import Tried, tried
+
+FloatArray = npt.NDArray[np.float64]
+
+FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
+SIDE_BY_SIDE = 16  # starts of a pair that are led on …
+OF_MODES = 48  # … and of one with a further mode, which may be anywhere and of either sign
+NEARER = 40  # pairs that come to the second stage …
+NEAREST = 6  # … and that are refitted in full
+BEST_SINGLES = 3  # whose forms stand for their effects too
+
+#: The forms that stand for the others of their effects; of an effect without one here, the first.
+STANDING = {
+    "acoustic_mode:mode",
+    "nonlinear_damping:quadratic_end",
+    "nonlinear_damping:cubic_end",
+    "flame_dynamics:pole",
+    "flame_dynamics:second_time_scale",
+    "flame_dynamics:second_order",
+    "nonlinearity_shape:quintic",
+    "nonlinearity_shape:tanh",
+    "nonlinearity_shape:quadratic_odd",
+    "actuator_dynamics:resonance",
+    "actuator_dynamics:delay",
+    "actuator_nonlinearity:quadratic_cubic",
+    "channel_mismatch:gain_skew",
+    "parameter_drift:frequency_settling",
+    "parameter_drift:several",
+}
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """What a worker needs to seek two effects at once."""
+
+    plain: Structure
+    effects: tuple[Effect, Effect]
+    data: Dataset
+    rough: Dataset
+    known: Known
+    placements: tuple[tuple[float, ...], ...]
+
+    @property
+    def richer(self) -> Structure | None:
+        """The structure that says the same as the plain one with the first effect, if any."""
+        return self.effects[0].restated(self.plain)
+
+    @property
+    def sought(self) -> Structure:
+        """What is led through the stages: with the richer structure, or with both effects."""
+        if self.richer is not None:
+            return self.richer.with_effects(self.effects[1])
+        return self.plain.with_effects(*self.effects)
+
+
+@dataclass(frozen=True)
+class _Led:
+    """A pair with the best of its starts, best first."""
+
+    pair: _Pair
+    starts: tuple[CoarseStart, ...]
+
+
+def pairs_from_afar(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    available: Sequence[Effect],
+    singles: Sequence[Tried],
+    executor: Executor,
+    progress: Callable[[float, str], None],
+) -> list[Tried]:
+    """The pairs of effects that come nearest from the slow flow, refitted; `base` is the declared
+    fit, which sizes of effects lean on."""
+    forms = representatives(available, singles)
+    rough, known = data.coarse(), known_sizes(data, base)
+    placements = likely_placements(structure, rough)
+    pairs = [
+        _Pair(structure, both, data, rough, known, placements)
+        for both in combinations(forms, 2)
+        if both[0].name != both[1].name
+    ]
+    pairs.sort(key=lambda p: p.richer is None)  # which take longest: not to be waited for
+    led = []
+    for i, found in enumerate(executor.map(_lead, pairs), start=1):
+        led.append(found)
+        progress(0.7 * i / len(pairs), f"seeking {_named(found.pair)}")
+    second = list(executor.map(_lead_on, _best(led, NEARER)))
+    progress(0.85, "refitting pairs")
+    chosen = _best(second, NEAREST)
+    fits = list(executor.map(_refit, chosen))
+    progress(1.0, "refitting pairs")
+    return [
+        tried(found.pair.effects, fit, data)
+        for found, fit in zip(chosen, fits, strict=True)
+        if np.isfinite(fit.chi2)
+    ]
+
+
+def representatives(available: Sequence[Effect], singles: Sequence[Tried]) -> list[Effect]:
+    """The forms that stand for their effects from afar, and those of the best singles; those that
+    have a richer structure first."""
+    named = {e.name for e in available if e.key in STANDING}
+    firsts = {e.name: e.key for e in reversed(available) if e.name not in named}
+    near = {t.effects[0].key for t in singles[:BEST_SINGLES]}
+    keys = STANDING | near | set(firsts.values())
+    chosen = [e for e in available if e.key in keys and not e.refines]
+    return sorted(chosen, key=lambda e: e.restated(Structure()) is None)
+
+
+def _named(pair: _Pair) -> str:
+    return " and ".join(e.key for e in pair.effects)
+
+
+def _lead(pair: _Pair) -> _Led:
+    """The pair's starts through the first stage."""
+    if pair.richer is not None:
+        rows = [pair.effects[1].neutral() or pair.effects[1].starts(pair.known)[0]]
+        placements = tuple(dense_placements(pair.richer.mode_count - 1))
+        many = OF_MODES
+    else:
+        each = (e.starts(pair.known) for e in pair.effects)
+        rows = [(*first, *second) for first, second in product(*each)]
+        placements, many = pair.placements, SIDE_BY_SIDE
+    starts = signed_starts(pair.sought, pair.rough, rows, placements)[:many]
+    return _Led(pair, tuple(polish(pair.sought, pair.rough, starts, (FIRST,), 6)[:3]))
+
+
+def _lead_on(led: _Led) -> _Led:
+    pair = led.pair
+    starts = polish(pair.sought, pair.rough, led.starts, (SECOND,), 10)
+    return _Led(pair, tuple(starts[:2]))
+
+
+def _refit(led: _Led) -> Fit:
+    """To the data's own noise, with the effects by their names."""
+    thetas = np.stack([_by_name(led.pair, s.theta) for s in led.starts])
+    structure = led.pair.plain.with_effects(*led.pair.effects)
+    return fit_orbits(structure, led.pair.data, thetas, continuation=(0.003, 0.0))
+
+
+def _by_name(pair: _Pair, theta: FloatArray) -> FloatArray:
+    """Unknowns with both effects from those of the structure sought."""
+    if pair.richer is None:
+        return theta
+    first, second = pair.effects
+    p = pair.sought.parameters.plain(theta)
+    named = first.from_restated(pair.plain, p)
+    values = [*named, *(p[q.name] for q in second.parameters)]
+    return pair.plain.with_effects(first, second).parameters.to_internal(values)
+
+
+def _best(led: Sequence[_Led], count: int) -> list[_Led]:
+    """Those that came nearest, no more than two of the same effects."""
+    out: list[_Led] = []
+    for found in sorted((f for f in led if f.starts), key=lambda f: f.starts[0].cost):
+        names = {e.name for e in found.pair.effects}
+        same = sum({e.name for e in o.pair.effects} == names for o in out)
+        if same < 2:
+            out.append(found)
+    return out[:count]
