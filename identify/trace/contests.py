@@ -228,7 +228,7 @@ def reformed(
 def at_the_same_place(
     tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
 ) -> list[Tried]:
-    """Other effects at the location of the one that explains the data, from where it ended.
+    """Other effects at the location of each that explains the data, from where it ended.
 
     They are the likeliest to predict the same, and may have lost their way on coarse noise.
     """
@@ -238,12 +238,14 @@ def at_the_same_place(
     best = best_form(good)
     done = {t.key_of_forms for t in tries if t.adequate}
     items = [
-        (best, (), best.effects[0], e, data)
+        (best, kept, old, e, data)
+        for old in best.effects
+        for kept in [tuple(o for o in best.effects if o is not old)]
         for e in available
-        if e.location == best.effects[0].location
-        and e.name != best.effects[0].name
+        if e.location == old.location
+        and e.name not in best.names
         and not e.refines
-        and (e.key,) not in done
+        and key_of_forms((*kept, e)) not in done
     ]
     fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
     return [tried(fit.structure.effects, fit, data) for fit in fits]

@@ -107,7 +107,11 @@ def search(
             structure, data, base, apart, singles, run,
             lambda share, text: report(0.6 + 0.3 * share, text),
         )  # fmt: skip
-        return [eliminate(t, data) if t.explains else t for t in led_to_the_end(pairs)]
+        pairs = led_to_the_end(pairs)
+        pairs += at_the_same_place(pairs, data, available, run)
+        # all that may stand beside one of them has been sought beside it already
+        extended.update((e.key,) for t in pairs if t.explains for e in t.effects)
+        return [eliminate(t, data) if t.explains else t for t in pairs]
 
     def led_to_the_end(grown: list[Tried]) -> list[Tried]:
         grown = [*grown, *led_on(grown, data, run)]
@@ -116,7 +120,8 @@ def search(
             grown += reformed(grown, data, available, run, done)
         return grown
 
-    if level and level[0].fit.chi2_per_dof > GROSS:  # no single is a place to grow from
+    afar = bool(level) and level[0].fit.chi2_per_dof > GROSS  # no single is a place to grow from
+    if afar:
         everything += from_afar()
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
@@ -156,6 +161,8 @@ def search(
                 alone = [t for t in everything if t.spread is not None and len(t.effects) == 1]
                 found = _beside_chance(alone, data, apart, run)
                 everything += [*found, *_without_chance(found, data)]
+            if base.chi2_per_dof > GROSS and not afar:
+                everything += from_afar()
     if not any(t.explains for t in everything):
         certain = [t for t in everything if t.spread is None]
         everything += reformed(certain, data, available, run, done)
