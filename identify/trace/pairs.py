@@ -7,7 +7,7 @@ declared mode. What comes nearest is led on, and the best few are refitted.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np

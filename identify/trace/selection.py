@@ -1,7 +1,7 @@
 """The search: singles, run-to-run scatter, pairs and triples, and what contests them."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -62,117 +62,166 @@ def search(
 
     `scores` are the candidates' tests at the base fit, where they are known already.
     """
-    run = executor or InProcess()
-    report = progress or (lambda share, text: None)
-    scatters = [e for e in catalogue if isinstance(e, Scatter)]
-    available = [e for e in catalogue if usable(e, data, structure)]
-    apart = [e for e in available if not e.refines]
-    singles = try_effects(
+    going = _Searching(
         structure,
         data,
         base,
-        apart,
-        executor=run,
-        keep=8,
-        far=base.chi2_per_dof > GROSS,
-        progress=lambda share, text: report(0.6 * share, text),
-        scores=scores,
+        executor or InProcess(),
+        progress or (lambda share, text: None),
+        tuple(e for e in catalogue if usable(e, data, structure)),
+        tuple(e for e in catalogue if isinstance(e, Scatter)),
     )
-    if not any(t.adequate for t in singles) and base.chi2_per_dof > GROSS:
-        report(0.6, "starting the best once more from afar")
-        singles = started_again(singles, data, run)
-    if not any(t.explains for t in singles):
-        richer = [e for e in available if e.refines and e.restated(structure) is not None]
-        found = try_effects(
-            structure, data, base, richer, executor=run, keep=1, far=False,
-            progress=lambda share, text: report(0.6, text),
-        )  # fmt: skip
-        # of so many parameters that, beside another effect, they would stand for it
-        singles += [t for t in found if t.explains]
-    singles = [*singles, *in_other_forms(singles, data, available, run)]
-    singles += at_the_same_place(singles, data, available, run)
-    singles += led_on(singles, data, run)
-    everything = list(singles)
-    if base.chi2_per_dof < LITTLE or not any(t.explains for t in everything):
-        report(0.6, "trying run-to-run scatter")
-        everything += try_scatters(structure, data, base, scatters, run)
-    level = best_by_name(singles)
-    extended: set[tuple[str, ...]] = {()}
-    done: set[tuple[str, ...]] = set()
-
-    def from_afar() -> list[Tried]:
-        if depth < 2 or any(t.explains for t in everything):
-            return []
-        pairs = pairs_from_afar(
-            structure, data, base, apart, singles, run,
-            lambda share, text: report(0.6 + 0.3 * share, text),
-        )  # fmt: skip
-        pairs = led_to_the_end(pairs)
-        pairs += at_the_same_place(pairs, data, available, run)
-        # all that may stand beside one of them has been sought beside it already
-        extended.update((e.key,) for t in pairs if t.explains for e in t.effects)
-        return [eliminate(t, data) if t.explains else t for t in pairs]
-
-    def led_to_the_end(grown: list[Tried]) -> list[Tried]:
-        grown = [*grown, *led_on(grown, data, run)]
-        if not any(t.explains for t in grown):
-            report(0.6, "trying other forms of the best")
-            grown += reformed(grown, data, available, run, done)
-        return grown
-
-    afar = bool(level) and level[0].fit.chi2_per_dof > GROSS  # no single is a place to grow from
-    if afar:
-        everything += from_afar()
+    singles = going.alone(scores)
+    pairs: list[Tried] = []
+    if depth > 1 and going.gross(singles):  # no single is a place to grow from
+        pairs = going.pairs(singles)
+    level = best_by_name([*singles, *pairs])
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
-        explaining = [t for t in everything if t.explains]
+        explaining = [t for t in going.tried if t.explains]
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
-        grown: list[Tried] = []
-        parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
-        for parent in parents:
-            extended.add(parent.key_of_forms)
-            rest = [e for e in apart if e.name not in parent.names]
-            grown += try_effects(
-                parent.fit.structure, data, parent.fit, rest, executor=run, keep=5, far=False,
-                progress=lambda share, text: report(0.6 + 0.35 * share, text),
-            )  # fmt: skip
-        if not grown:
-            break
-        far = base.chi2_per_dof > GROSS and not explaining
-        if far and not any(t.adequate for t in grown):
-            grown = started_again(grown, data, run)
-        grown = led_to_the_end(grown)
-        level = best_by_name(grown)
-        # what leaves a misfit is no better for having less in it; the best are shown without
-        for t in grown:
-            shorten = t.adequate or any(t is best for best in level[:SHORTENED])
-            everything.append(eliminate(t, data) if shorten else t)
-        if len(parents[0].effects) == 1:
-            report(0.6, "trying run-to-run scatter beside an effect")
-            good = [t for t in everything if t.explains]
-            for parent in parents:
-                if good and parent.names[0] not in best_form(good).names:
-                    continue  # no rival: what explains the data does so without it
-                other = [s for s in scatters if s.name not in parent.names]
-                found = try_scatters(parent.fit.structure, data, parent.fit, other, run)
-                everything += [*found, *_without_chance(found, data)]
-            if not any(t.explains for t in everything):
-                alone = [t for t in everything if t.spread is not None and len(t.effects) == 1]
-                found = _beside_chance(alone, data, apart, run)
-                everything += [*found, *_without_chance(found, data)]
-            if base.chi2_per_dof > GROSS and not afar:
-                everything += from_afar()
-    if not any(t.explains for t in everything):
-        certain = [t for t in everything if t.spread is None]
-        everything += reformed(certain, data, available, run, done)
-    everything += in_their_places(everything, data, apart, run, extended, report)
-    everything += _beside_the_same_chance(everything, data, apart, run, report)
-    everything += settled(everything, data, run)
-    everything = against_chance(everything)
+        parents = [t for t in level if len(t.effects) == size - 1]
+        parents = sorted(parents, key=lambda t: not t.fit.converged)[:2]
+        grown = going.grown(parents)
+        if size == 2 and grown:
+            going.with_chance(parents)
+            if not pairs and base.chi2_per_dof > GROSS:
+                pairs = going.pairs(singles)
+        level = best_by_name([*grown, *pairs])
+    going.contest()
+    everything = against_chance(going.tried)
     return Search(
         tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
     )
+
+
+@dataclass
+class _Searching:
+    """A search under way: what it works on, and all that has been tried so far."""
+
+    structure: Structure
+    data: Dataset
+    base: Fit
+    run: Executor
+    report: Progress
+    available: tuple[Effect, ...]
+    scatters: tuple[Scatter, ...]
+    tried: list[Tried] = field(default_factory=list)
+    extended: set[tuple[str, ...]] = field(default_factory=lambda: {()})  # keys: grown from …
+    done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
+
+    @property
+    def apart(self) -> list[Effect]:
+        """The forms that need no other to start from."""
+        return [e for e in self.available if not e.refines]
+
+    @property
+    def explained(self) -> bool:
+        return any(t.explains for t in self.tried)
+
+    def gross(self, tries: Sequence[Tried]) -> bool:
+        """Whether even the best of them leaves a gross misfit."""
+        return min((t.fit.chi2_per_dof for t in tries), default=0.0) > GROSS
+
+    def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
+        """Every effect by itself, and run-to-run scatter."""
+        data, base, run = self.data, self.base, self.run
+        far = base.chi2_per_dof > GROSS
+        singles = try_effects(
+            self.structure, data, base, self.apart, executor=run, keep=8, far=far,
+            progress=lambda share, text: self.report(0.6 * share, text), scores=scores,
+        )  # fmt: skip
+        if far and not any(t.adequate for t in singles):
+            self.report(0.6, "starting the best once more from afar")
+            singles = started_again(singles, data, run)
+        richer = [e for e in self.available if e.refines and e.restated(self.structure) is not None]
+        if richer and not any(t.explains for t in singles):
+            found = try_effects(
+                self.structure, data, base, richer, executor=run, keep=1, far=False,
+                progress=lambda share, text: self.report(0.6, text),
+            )  # fmt: skip
+            # of so many parameters that, beside another effect, they would stand for it
+            singles += [t for t in found if t.explains]
+        singles += in_other_forms(singles, data, self.available, run)
+        singles += at_the_same_place(singles, data, self.available, run)
+        singles += led_on(singles, data, run)
+        self.tried += singles
+        if base.chi2_per_dof < LITTLE or not self.explained:
+            self.report(0.6, "trying run-to-run scatter")
+            self.tried += try_scatters(self.structure, data, base, self.scatters, run)
+        return singles
+
+    def pairs(self, singles: Sequence[Tried]) -> list[Tried]:
+        """Two effects sought at once, unless what has been tried explains the data."""
+        if self.explained:
+            return []
+        pairs = pairs_from_afar(
+            self.structure, self.data, self.base, self.apart, singles, self.run,
+            lambda share, text: self.report(0.6 + 0.3 * share, text),
+        )  # fmt: skip
+        pairs = self._led_to_the_end(pairs)
+        pairs += at_the_same_place(pairs, self.data, self.available, self.run)
+        # all that may stand beside one of them has been sought beside it already
+        self.extended.update((e.key,) for t in pairs if t.explains for e in t.effects)
+        self.tried += [eliminate(t, self.data) if t.explains else t for t in pairs]
+        return pairs
+
+    def grown(self, parents: Sequence[Tried]) -> list[Tried]:
+        """One effect more on top of each of `parents`."""
+        grown: list[Tried] = []
+        far = self.base.chi2_per_dof > GROSS and not self.explained
+        for parent in parents:
+            self.extended.add(parent.key_of_forms)
+            rest = [e for e in self.apart if e.name not in parent.names]
+            grown += try_effects(
+                parent.fit.structure, self.data, parent.fit, rest, executor=self.run, keep=5,
+                far=False, progress=lambda share, text: self.report(0.6 + 0.35 * share, text),
+            )  # fmt: skip
+        if not grown:
+            return []
+        if far and not any(t.adequate for t in grown):
+            grown = started_again(grown, self.data, self.run)
+        grown = self._led_to_the_end(grown)
+        # what leaves a misfit is no better for having less in it; the best are shown without
+        best = best_by_name(grown)[:SHORTENED]
+        for t in grown:
+            shorten = t.adequate or any(t is b for b in best)
+            self.tried.append(eliminate(t, self.data) if shorten else t)
+        return grown
+
+    def _led_to_the_end(self, grown: Sequence[Tried]) -> list[Tried]:
+        """With what had not converged led on, and, if still nothing explains, in other forms."""
+        out = [*grown, *led_on(grown, self.data, self.run)]
+        if not any(t.explains for t in out):
+            self.report(0.6, "trying other forms of the best")
+            out += reformed(out, self.data, self.available, self.run, self.done)
+        return out
+
+    def with_chance(self, parents: Sequence[Tried]) -> None:
+        """Run-to-run scatter beside each of `parents`, and effects beside scatter."""
+        self.report(0.6, "trying run-to-run scatter beside an effect")
+        good = [t for t in self.tried if t.explains]
+        for parent in parents:
+            if good and parent.names[0] not in best_form(good).names:
+                continue  # no rival: what explains the data does so without it
+            other = [s for s in self.scatters if s.name not in parent.names]
+            found = try_scatters(parent.fit.structure, self.data, parent.fit, other, self.run)
+            self.tried += [*found, *_without_chance(found, self.data)]
+        if not self.explained:
+            alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
+            found = _beside_chance(alone, self.data, self.apart, self.run)
+            self.tried += [*found, *_without_chance(found, self.data)]
+
+    def contest(self) -> None:
+        """What might do as well as the best is tried before it is claimed."""
+        data, run = self.data, self.run
+        if not self.explained:
+            certain = [t for t in self.tried if t.spread is None]
+            self.tried += reformed(certain, data, self.available, run, self.done)
+        self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
+        self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
+        self.tried += settled(self.tried, data, run)
 
 
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:

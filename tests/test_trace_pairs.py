@@ -1,0 +1,112 @@
+"""Two gross effects sought at once: each alone leads the search for the other astray."""
+
+from pathlib import Path
+
+import pytest
+
+from identify import start, trace
+from identify.effects import CATALOGUE, by_key
+from identify.executor import InProcess
+from identify.structure import Structure
+from identify.trace.pairs import STANDING, pairs_from_afar, representatives
+from tests.trace_material import fitted, thesis_campaign, tried_as
+
+pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
+
+THIRD_MODE = {
+    "frequency_hz": 393.86,
+    "damping": 0.05,
+    "flame_residue_ratio": 0.18,
+    "speaker_residue_ratio": -0.06,
+}
+
+
+@pytest.mark.parametrize(
+    ("effects", "keys"),
+    [
+        (
+            {"acoustic_mode": THIRD_MODE, "flame_delay": {"delay_s": 8e-4}},
+            {"acoustic_mode:mode", "flame_delay"},
+        ),
+        (
+            {"actuator_dynamics/delay": {"delay_s": 5e-4}, "flame_delay": {"delay_s": 8e-4}},
+            {"actuator_dynamics:delay", "flame_delay"},
+        ),
+    ],
+    ids=["third mode", "speaker"],
+)
+def test_two_gross_effects(
+    tmp_path: Path, effects: dict[str, dict[str, float]], keys: set[str]
+) -> None:
+    ready = thesis_campaign(tmp_path, 4, effects)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert base.chi2_per_dof > trace.GROSS
+    said: list[str] = []
+    others = {"flame_dynamics:pole", "nonlinearity_shape:quintic", "channel_mismatch:gain_skew"}
+    found = pairs_from_afar(
+        ready.structure, ready.data, base, [by_key(k) for k in sorted(keys | others)], [],
+        InProcess(), lambda share, text: said.append(text),
+    )  # fmt: skip
+    best = trace.best_form([t for t in found if t.explains])
+    assert {e.key for e in best.effects} == keys
+    delay = best.estimates["flame_delay.delay_s"]
+    assert abs(delay.value - 8e-4) < 4 * delay.stderr
+    assert said[0].startswith("seeking ")
+    assert said[-1] == "refitting pairs"
+
+
+def test_which_forms_stand_for_others() -> None:
+    """Those listed, the best singles', and the first of an effect without one."""
+    assert {e.key for e in CATALOGUE} >= STANDING
+    near = tried_as(fitted(14, 20.0), "actuator_dynamics:pole")
+    unlisted = [by_key(f"sensor_offset:{form}") for form in ("mode_shapes", "propagation")]
+    available = [*unlisted, *(by_key(k) for k in ("actuator_dynamics:pole", "acoustic_mode:mode"))]
+    listed = [by_key("actuator_dynamics:delay"), by_key("actuator_dynamics:acceleration")]
+    chosen = [e.key for e in representatives([*available, *listed], [near])]
+    assert chosen[0] == "acoustic_mode:mode"  # another structure says the same
+    assert sorted(chosen[1:]) == [
+        "actuator_dynamics:delay",
+        "actuator_dynamics:pole",
+        "sensor_offset:mode_shapes",
+    ]
+    alone = representatives([*available, *listed], [])
+    assert "actuator_dynamics:pole" not in [e.key for e in alone]
+
+
+def test_signed_starts_have_both_signs_in_each_other_mode(tmp_path: Path) -> None:
+    ready = thesis_campaign(tmp_path, 4, {})
+    structure = Structure(3)
+    placements = [(1.67, 2.33), (2.0, 3.0)]
+    found = start.signed_starts(structure, ready.data.coarse(), ((),), placements)
+    values = [structure.parameters.plain(s.theta) for s in found]
+    kinds = {
+        (
+            round(v["mode2.frequency_hz"] / ready.data.free_hz, 2),
+            *(bool(v[f"mode{i}.flame_residue"] > 0) for i in (2, 3)),
+        )
+        for v in values
+    }
+    assert len(kinds) == len(found) == 8
+    assert [s.cost for s in found] == sorted(s.cost for s in found)
+
+
+@pytest.mark.parametrize(
+    ("form", "truth", "values"),
+    [
+        ("gain", {"gain": 0.02}, {"channel_mismatch.gain": 0.02}),
+        # what is sampled later is read as if it came earlier
+        ("skew", {"skew_s": 2e-5}, {"channel_mismatch.skew_s": -2e-5}),
+    ],
+)
+def test_a_free_run_is_corrected_for_its_microphones(
+    tmp_path: Path, form: str, truth: dict[str, float], values: dict[str, float]
+) -> None:
+    """What leaks into a free run's velocity is in the measurement's own phase."""
+    key = f"channel_mismatch:{form}"
+    ready = thesis_campaign(tmp_path, 4, {key.replace(":", "/"): truth})
+    assert any(b.free for b in ready.data.fit)
+    clean = start.corrected(ready.data, [by_key(key)], values)
+    assert clean is not None
+    before = start.fit_from_data(ready.structure, ready.data)
+    after = start.fit_from_data(ready.structure, clean)
+    assert after.chi2_per_dof < 1.5 < before.chi2_per_dof
