@@ -13,6 +13,7 @@ from identify.fit import Fit, fit_orbits
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
+    NEAR,
     at_the_same_place,
     eliminate,
     in_other_forms,
@@ -73,7 +74,7 @@ def search(
     )
     singles = going.alone(scores)
     pairs: list[Tried] = []
-    if depth > 1 and going.gross(singles):  # no single is a place to grow from
+    if depth > 1 and _least(singles) > GROSS:  # no single is a place to grow from
         pairs = going.pairs(singles)
     level = best_by_name([*singles, *pairs])
     for size in range(2, depth + 1):
@@ -86,7 +87,7 @@ def search(
         grown = going.grown(parents)
         if size == 2 and grown:
             going.with_chance(parents)
-            if not pairs and base.chi2_per_dof > GROSS:
+            if not pairs and base.chi2_per_dof > GROSS and _least(grown) > NEAR:
                 pairs = going.pairs(singles)
         level = best_by_name([*grown, *pairs])
     going.contest()
@@ -119,10 +120,6 @@ class _Searching:
     @property
     def explained(self) -> bool:
         return any(t.explains for t in self.tried)
-
-    def gross(self, tries: Sequence[Tried]) -> bool:
-        """Whether even the best of them leaves a gross misfit."""
-        return min((t.fit.chi2_per_dof for t in tries), default=0.0) > GROSS
 
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
@@ -195,7 +192,8 @@ class _Searching:
         out = [*grown, *led_on(grown, self.data, self.run)]
         if not any(t.explains for t in out):
             self.report(0.6, "trying other forms of the best")
-            out += reformed(out, self.data, self.available, self.run, self.done)
+            others = reformed(out, self.data, self.available, self.run, self.done)
+            out += [*others, *led_on(others, self.data, self.run)]
         return out
 
     def with_chance(self, parents: Sequence[Tried]) -> None:
@@ -222,6 +220,11 @@ class _Searching:
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
         self.tried += settled(self.tried, data, run)
+
+
+def _least(tries: Sequence[Tried]) -> float:
+    """χ²/dof of the best of them; 0 of none."""
+    return min((t.fit.chi2_per_dof for t in tries), default=0.0)
 
 
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
