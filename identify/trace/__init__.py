@@ -21,7 +21,6 @@
 from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
 from identify.trace.selection import (
-    GROSS,
     Cancelled,
     against_chance,
     refitted,
@@ -33,6 +32,7 @@ from identify.trace.stages import started_again, try_effects
 from identify.trace.tried import (
     ALPHA,
     EVIDENCE,
+    GROSS,
     Tried,
     accounts,
     best_by_name,

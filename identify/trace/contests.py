@@ -23,6 +23,7 @@ from identify.trace.stages import beside, known_sizes, louder, loudness, try_eff
 from identify.trace.tried import (
     ALPHA,
     EVIDENCE,
+    GROSS,
     Tried,
     best_by_name,
     best_form,
@@ -130,7 +131,8 @@ def _each_in_other_forms(
 
 
 def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) -> Fit | None:
-    """`t` with one of its effects in another form beside those kept; None where none starts."""
+    """`t` with one of its effects in another form, or another effect in its place, beside those
+    kept; None where none starts."""
     t, kept, old, form, data = item
     base = part_of(t, kept, data)
     larger = base.structure.with_effects(form)
@@ -262,7 +264,9 @@ def in_their_places(
     """Other effects in the place of each of several that explain the data together.
 
     The set was grown from one of them, so that only the places of the others have been contested.
-    One effect in the place of them all is sought too, from what they say of the declared model.
+    Where what remains without an effect is gross, that effect had its contest as a single one, and
+    beside the others only those `at_the_same_place` are near. One effect in the place of them all
+    is sought too, from what they say of the declared model.
     `extended` are the sets (of keys, sorted) that have been grown from already.
     """
     good = [t for t in tries if t.explains and t.spread is None]
@@ -280,9 +284,11 @@ def in_their_places(
         if not np.isfinite(base.chi2):
             continue
         names = {e.name for e in kept}
+        others = [a for a in available if a.name not in names and a.key not in already]
+        if kept and base.chi2_per_dof > GROSS:  # no place to start from
+            continue
         out += try_effects(
-            base.structure, data, base,
-            [a for a in available if a.name not in names and a.key not in already],
+            base.structure, data, base, others,
             executor=run, keep=5, far=False, scores=None if kept else {},
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip

@@ -26,14 +26,13 @@ from identify.trace.contests import (
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
-from identify.trace.tried import BEATEN, Tried, best_by_name, best_form, misfit, tried
+from identify.trace.tried import BEATEN, GROSS, Tried, best_by_name, best_form, misfit, tried
 
 Progress = Callable[[float, str], None]
 
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
-GROSS = 300.0  # χ²/dof beyond which the declared fit is no place to start from alone
 
 
 class Cancelled(Exception):
@@ -158,7 +157,6 @@ class _Searching:
             lambda share, text: self.report(0.6 + 0.3 * share, text),
         )  # fmt: skip
         pairs = self._led_to_the_end(pairs)
-        pairs += at_the_same_place(pairs, self.data, self.available, self.run)
         # all that may stand beside one of them has been sought beside it already
         self.extended.update((e.key,) for t in pairs if t.explains for e in t.effects)
         self.tried += [eliminate(t, self.data) if t.explains else t for t in pairs]
@@ -217,6 +215,9 @@ class _Searching:
         if not self.explained:
             certain = [t for t in self.tried if t.spread is None]
             self.tried += reformed(certain, data, self.available, run, self.done)
+        several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
+        near = at_the_same_place(several, data, self.available, run)
+        self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
         self.tried += settled(self.tried, data, run)

@@ -20,6 +20,7 @@ from identify.scatter import Spread
 from identify.structure import Effect
 
 ALPHA = 1e-3  # false-alarm probability of each significance test
+GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
