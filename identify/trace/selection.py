@@ -72,23 +72,20 @@ def search(
         tuple(e for e in catalogue if isinstance(e, Scatter)),
     )
     singles = going.alone(scores)
-    pairs: list[Tried] = []
-    if depth > 1 and _least(singles) > GROSS:  # no single is a place to grow from
-        pairs = going.pairs(singles)
-    level = best_by_name([*singles, *pairs])
+    level = best_by_name(singles)
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
-        parents = [t for t in level if len(t.effects) == size - 1]
-        parents = sorted(parents, key=lambda t: not t.fit.converged)[:2]
-        grown = going.grown(parents)
-        if size == 2 and grown:
+        parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
+        nowhere = size == 2 and _least(singles) > GROSS  # no single is a place to grow from
+        found = going.pairs(singles) if nowhere else going.grown(parents)
+        if size == 2:
             going.with_chance(parents)
-            if not pairs and base.chi2_per_dof > GROSS and _least(grown) > NEAR:
-                pairs = going.pairs(singles)
-        level = best_by_name([*grown, *pairs])
+            if not nowhere and base.chi2_per_dof > GROSS and _least(found) > NEAR:
+                found += going.pairs(singles)
+        level = best_by_name(found)
     going.contest()
     everything = against_chance(going.tried)
     return Search(
@@ -150,7 +147,7 @@ class _Searching:
 
     def pairs(self, singles: Sequence[Tried]) -> list[Tried]:
         """Two effects sought at once, unless what has been tried explains the data."""
-        if self.explained:
+        if any(t.explains and len(t.effects) > 1 for t in self.tried):
             return []
         pairs = pairs_from_afar(
             self.structure, self.data, self.base, self.apart, singles, self.run,
