@@ -38,6 +38,7 @@ class AcousticMode(Effect):
         self.parameters = tuple(
             q for i in range(1, more + 1) for q in _mode_parameters("" if i == 1 else str(i))
         )
+        self.located = tuple(q.name for q in self.parameters if q.unit == "Hz")
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         r, a = 0.02 * known.flame_residues[0], 0.02 * known.speaker_residues[0]

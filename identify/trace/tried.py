@@ -76,10 +76,17 @@ class Tried:
     def plausible(self) -> bool:
         if self.spread is not None and self.spread.objection:
             return False
-        values = {name: e.value for name, e in self.estimates.items()}
+        known = self.estimates
+        values = {name: e.value for name, e in known.items()}
         inside = all(q.plausible(values[q.name]) for e in self.effects for q in e.parameters)
-        return inside and all(
-            values[f"mode{i}.damping"] < 0.7 for i in range(1, self.fit.structure.mode_count + 1)
+        seen = all(known[n].stderr < abs(values[n]) for e in self.effects for n in e.located)
+        return (
+            inside
+            and seen
+            and all(
+                values[f"mode{i}.damping"] < 0.7
+                for i in range(1, self.fit.structure.mode_count + 1)
+            )
         )
 
 
