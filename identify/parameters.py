@@ -17,6 +17,8 @@ from identify import dual
 
 FloatArray = npt.NDArray[np.float64]
 
+EDGE = 1e-6  # of a bound: what is no farther from it has been stopped there
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -45,7 +47,9 @@ class Parameter:
         return float(np.exp(internal)) if self.kind == "positive" else self.scale
 
     def plausible(self, value: float) -> bool:
-        return self.lower <= value <= self.upper
+        """Whether it lies in the range; a positive one, kept there by the fit, not at its edge."""
+        edge = EDGE if self.kind == "positive" else 0.0
+        return self.lower * (1 + edge) <= value <= self.upper * (1 - edge)
 
 
 @dataclass(frozen=True)

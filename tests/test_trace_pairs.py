@@ -1,7 +1,9 @@
 """Two gross effects sought at once: each alone leads the search for the other astray."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from identify import start, trace
@@ -108,3 +110,30 @@ def test_a_free_run_is_corrected_for_its_microphones(
     before = start.fit_from_data(ready.structure, ready.data)
     after = start.fit_from_data(ready.structure, clean)
     assert after.chi2_per_dof < 1.5 < before.chi2_per_dof
+
+
+def test_what_has_been_stopped_at_the_edge_of_its_range_is_not_plausible() -> None:
+    effect = by_key("acoustic_mode:mode")
+    damping = effect.parameters[1]
+    assert damping.plausible(0.05)
+    assert not damping.plausible(np.exp(np.log(damping.lower)))
+    coefficient = by_key("nonlinear_damping:cubic").parameters[0]
+    assert coefficient.plausible(0.0)  # a signed one may end there of itself
+
+
+def test_a_further_mode_must_be_somewhere() -> None:
+    """Of a frequency that the data do not know to within its own size nothing has been seen."""
+    mode = by_key("acoustic_mode:mode")
+    structure = Structure(2).with_effects(mode)
+    values = {q.name: 1.0 for q in structure.parameters.parameters}
+    values |= {"mode1.damping": 0.01, "mode2.damping": 0.05, "acoustic_mode.damping": 0.04}
+    values |= {"acoustic_mode.frequency_hz": 400.0}
+    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+    at = structure.parameters.index["acoustic_mode.frequency_hz"]
+    for relative, seen in ((0.3, True), (4.0, False)):
+        covariance = np.zeros((theta.size, theta.size))
+        covariance[at, at] = relative**2  # of the logarithm
+        fit = replace(
+            fitted(theta.size, 1.0), structure=structure, theta=theta, covariance=covariance
+        )
+        assert tried_as(fit, mode.key).plausible is seen
