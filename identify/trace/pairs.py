@@ -18,14 +18,13 @@ from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Effect, Known, Structure
-from identify.trace.stages import known_sizes, likely_placements
+from identify.trace.stages import OF_MODES, known_sizes, likely_placements
 from identify.trace.tried import Tried, tried
 
 FloatArray = npt.NDArray[np.float64]
 
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
-SIDE_BY_SIDE = 16  # starts of a pair that are led on …
-OF_MODES = 48  # … and of one with a further mode, which may be anywhere and of either sign
+SIDE_BY_SIDE = 16  # starts of a pair without a further mode that are led on
 NEARER = 40  # pairs that come to the second stage …
 NEAREST = 6  # … and that are refitted in full
 BEST_SINGLES = 3  # whose forms stand for their effects too

@@ -22,9 +22,11 @@ from identify.start import (
     candidates,
     coarse,
     corrected,
+    dense_placements,
     every_start,
     physical_starts,
     polish,
+    signed_starts,
 )
 from identify.structure import Effect, Known, Structure
 from identify.trace.scores import ScoreTest, scan, score_tests
@@ -36,6 +38,7 @@ AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
 SURELY = 4  # so many are refitted in any case
 PROMISED = 0.4  # share of χ² that a small effect would take away: refitted straight from the base
+OF_MODES = 48  # starts of one more mode, which may be anywhere and of either sign
 SHAPES = 4  # so many are started from of an effect whose shape is unknown
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 FINE = 0.015  # share of noise below which all harmonics are looked at
@@ -82,6 +85,11 @@ class _Task:
     def seen(self) -> Dataset:
         """What the first stages look at: all harmonics where the misfit is small."""
         return self.rough if self.shares[0] > FINE else self.data
+
+    @property
+    def richer(self) -> Structure | None:
+        """The structure that says the same as the declared one with the effect, if any."""
+        return None if self.structure.effects else self.effect.restated(self.structure)
 
     @property
     def proposals(self) -> list[tuple[float, ...]]:
@@ -133,16 +141,19 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
         thetas.append(np.r_[task.base.theta, np.clip(task.score.size, -bound, bound)])
     first = task.shares[0]
     starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
-    richer = None if task.structure.effects else task.effect.restated(task.structure)
-    if richer is not None:
-        found = every_start(richer, task.rough)[:6]
-        restated = [
-            task.effect.from_restated(task.structure, richer.parameters.plain(s.theta))
-            for s in found
-        ]
-        rows = [larger.parameters.to_internal(v) for v in restated]
+    if task.richer is not None:
+        rows = _by_name(task, every_start(task.richer, task.rough)[:6])
         starts += polish(larger, task.rough, coarse(larger, task.rough, rows), (ROUGH,), 8)[:2]
     return polish(larger, task.seen, starts, (first,), 8)[:3]
+
+
+def _by_name(task: _Task, starts: Sequence[CoarseStart]) -> list[FloatArray]:
+    """Unknowns with the effect from starts of the richer structure."""
+    assert task.richer is not None
+    plain, structure = task.richer.parameters.plain, task.structure
+    larger = structure.with_effects(task.effect).parameters
+    named = [task.effect.from_restated(structure, plain(s.theta)) for s in starts]
+    return [larger.to_internal(values) for values in named]
 
 
 def _from_afar(task: _Task) -> list[CoarseStart]:
@@ -151,6 +162,11 @@ def _from_afar(task: _Task) -> list[CoarseStart]:
     inherited = [task.base.values[q.name] for e in task.structure.effects for q in e.parameters]
     rows = [[*inherited, *row] for row in task.proposals]
     starts = physical_starts(larger, task.rough, rows, task.placements)[:4]
+    if task.richer is not None:  # of another mode: anywhere, and of either sign
+        dense = dense_placements(task.richer.mode_count - 1)
+        signed = signed_starts(task.richer, task.rough, placements=dense)[:OF_MODES]
+        found = polish(task.richer, task.rough, signed, (ROUGH,), 6)[:2]
+        starts += coarse(larger, task.rough, _by_name(task, found))
     led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
     return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
 
