@@ -42,7 +42,7 @@ REFINED = 1500  # iterations of a form that refines another: a long valley may l
 LED_ON = 4  # of the best of a level that had not converged …
 FARTHEST = 300  # … by so many iterations more
 REFORMED = 3  # sets of effects of which other forms are tried …
-NEAR = 10.0  # … where they leave no more than so much χ²/dof
+NEAR = 30.0  # … where they leave no more than so much χ²/dof
 
 
 def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
