@@ -18,7 +18,7 @@ from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Effect, Known, Structure
-from identify.trace.stages import OF_MODES, known_sizes, likely_placements
+from identify.trace.stages import OF_MODES, canonical, known_sizes, likely_placements
 from identify.trace.tried import Tried, tried
 
 FloatArray = npt.NDArray[np.float64]
@@ -156,7 +156,9 @@ def _refit(led: _Led) -> Fit:
     """To the data's own noise, with the effects by their names."""
     thetas = np.stack([_by_name(led.pair, s.theta) for s in led.starts])
     structure = led.pair.plain.with_effects(*led.pair.effects)
-    return fit_orbits(structure, led.pair.data, thetas, continuation=(0.003, 0.0))
+    return canonical(
+        fit_orbits(structure, led.pair.data, thetas, continuation=(0.003, 0.0)), led.pair.data
+    )
 
 
 def _by_name(pair: _Pair, theta: FloatArray) -> FloatArray:

@@ -183,7 +183,7 @@ def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     larger = task.structure.with_effects(task.effect)
     thetas = np.stack([s.theta for s in starts])
     fit = fit_orbits(larger, task.data, thetas, continuation=(task.shares[2], 0.0))
-    return _canonical(fit, task.data)
+    return canonical(fit, task.data)
 
 
 def _promise(task: _Task) -> tuple[float, list[FloatArray]]:
@@ -217,10 +217,10 @@ def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
     task, rows = item
     larger = task.structure.with_effects(task.effect)
     thetas = np.stack([np.r_[task.base.theta, row] for row in rows])
-    return _canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
+    return canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
 
 
-def _canonical(fit: Fit, data: Dataset) -> Fit:
+def canonical(fit: Fit, data: Dataset) -> Fit:
     """The same fit with its effects' parameters named by the effects' own rules."""
     structure = fit.structure
     plain = replace(structure, effects=())
