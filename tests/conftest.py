@@ -3,6 +3,9 @@
 ``@pytest.mark.component("PortAudio")`` skips, naming the component and its install command, where
 the machine lacks it. With ``ENTRAIN_REQUIRE_COMPONENTS=1`` (as `.ci/run` sets it) the same test
 fails instead, so that nothing passes there by not having run.
+
+Linear algebra is kept to one thread, here and in every process that a test starts: our matrices
+are small, and the workers of `pytest -n` would fight over the cores.
 """
 
 import ctypes.util
@@ -13,6 +16,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # read when NumPy is first imported
+    os.environ.setdefault(threads, "1")
 
 REQUIRE = "ENTRAIN_REQUIRE_COMPONENTS"
 SHARED = Path(__file__).resolve().parents[2] / "shared"
