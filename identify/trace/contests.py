@@ -281,14 +281,12 @@ def in_their_places(
         if kept and key_of_forms(kept) in extended:
             continue
         base = with_fewer(best, kept, data) if kept else part_of(best, (), data)
-        if not np.isfinite(base.chi2):
-            continue
+        if not np.isfinite(base.chi2) or (kept and base.chi2_per_dof > GROSS):
+            continue  # no place to start from
         names = {e.name for e in kept}
-        others = [a for a in available if a.name not in names and a.key not in already]
-        if kept and base.chi2_per_dof > GROSS:  # no place to start from
-            continue
         out += try_effects(
-            base.structure, data, base, others,
+            base.structure, data, base,
+            [a for a in available if a.name not in names and a.key not in already],
             executor=run, keep=5, far=False, scores=None if kept else {},
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip

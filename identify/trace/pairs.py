@@ -11,17 +11,14 @@ from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
-import numpy.typing as npt
 
 from identify.dataset import Dataset
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Effect, Known, Structure
-from identify.trace.stages import OF_MODES, canonical, known_sizes, likely_placements
+from identify.trace.stages import OF_MODES, by_name, canonical, known_sizes, likely_placements
 from identify.trace.tried import Tried, tried
-
-FloatArray = npt.NDArray[np.float64]
 
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
 SIDE_BY_SIDE = 16  # starts of a pair without a further mode that are led on
@@ -134,16 +131,17 @@ def _named(pair: _Pair) -> str:
 
 def _lead(pair: _Pair) -> _Led:
     """The pair's starts through the first stage."""
+    sought = pair.sought
     if pair.richer is not None:
         rows = [pair.effects[1].neutral() or pair.effects[1].starts(pair.known)[0]]
-        placements = tuple(dense_placements(pair.richer.mode_count - 1))
+        placements = tuple(dense_placements(sought.mode_count - 1))
         many = OF_MODES
     else:
         each = (e.starts(pair.known) for e in pair.effects)
         rows = [(*first, *second) for first, second in product(*each)]
         placements, many = pair.placements, SIDE_BY_SIDE
-    starts = signed_starts(pair.sought, pair.rough, rows, placements)[:many]
-    return _Led(pair, tuple(polish(pair.sought, pair.rough, starts, (FIRST,), 6)[:3]))
+    starts = signed_starts(sought, pair.rough, rows, placements)[:many]
+    return _Led(pair, tuple(polish(sought, pair.rough, starts, (FIRST,), 6)[:3]))
 
 
 def _lead_on(led: _Led) -> _Led:
@@ -154,22 +152,13 @@ def _lead_on(led: _Led) -> _Led:
 
 def _refit(led: _Led) -> Fit:
     """To the data's own noise, with the effects by their names."""
-    thetas = np.stack([_by_name(led.pair, s.theta) for s in led.starts])
-    structure = led.pair.plain.with_effects(*led.pair.effects)
-    return canonical(
-        fit_orbits(structure, led.pair.data, thetas, continuation=(0.003, 0.0)), led.pair.data
-    )
-
-
-def _by_name(pair: _Pair, theta: FloatArray) -> FloatArray:
-    """Unknowns with both effects from those of the structure sought."""
-    if pair.richer is None:
-        return theta
-    first, second = pair.effects
-    p = pair.sought.parameters.plain(theta)
-    named = first.from_restated(pair.plain, p)
-    values = [*named, *(p[q.name] for q in second.parameters)]
-    return pair.plain.with_effects(first, second).parameters.to_internal(values)
+    pair, thetas = led.pair, [s.theta for s in led.starts]
+    structure = pair.plain.with_effects(*pair.effects)
+    if pair.richer is not None:
+        found = map(pair.sought.parameters.plain, thetas)
+        thetas = [by_name(pair.effects[0], structure, p) for p in found]
+    fit = fit_orbits(structure, pair.data, np.stack(thetas), continuation=(0.003, 0.0))
+    return canonical(fit, pair.data)
 
 
 def _best(led: Sequence[_Led], count: int) -> list[_Led]:

@@ -146,7 +146,7 @@ class _Searching:
         return singles
 
     def pairs(self, singles: Sequence[Tried]) -> list[Tried]:
-        """Two effects sought at once, unless what has been tried explains the data."""
+        """Two effects sought at once, unless some together explain the data already."""
         if any(t.explains and len(t.effects) > 1 for t in self.tried):
             return []
         pairs = pairs_from_afar(

@@ -142,18 +142,17 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
     first = task.shares[0]
     starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
     if task.richer is not None:
-        rows = _by_name(task, every_start(task.richer, task.rough)[:6])
+        rows = _named_starts(task, every_start(task.richer, task.rough)[:6])
         starts += polish(larger, task.rough, coarse(larger, task.rough, rows), (ROUGH,), 8)[:2]
     return polish(larger, task.seen, starts, (first,), 8)[:3]
 
 
-def _by_name(task: _Task, starts: Sequence[CoarseStart]) -> list[FloatArray]:
+def _named_starts(task: _Task, starts: Sequence[CoarseStart]) -> list[FloatArray]:
     """Unknowns with the effect from starts of the richer structure."""
     assert task.richer is not None
-    plain, structure = task.richer.parameters.plain, task.structure
-    larger = structure.with_effects(task.effect).parameters
-    named = [task.effect.from_restated(structure, plain(s.theta)) for s in starts]
-    return [larger.to_internal(values) for values in named]
+    larger = task.structure.with_effects(task.effect)
+    found = [task.richer.parameters.plain(s.theta) for s in starts]
+    return [by_name(task.effect, larger, p) for p in found]
 
 
 def _from_afar(task: _Task) -> list[CoarseStart]:
@@ -166,7 +165,7 @@ def _from_afar(task: _Task) -> list[CoarseStart]:
         dense = dense_placements(task.richer.mode_count - 1)
         signed = signed_starts(task.richer, task.rough, placements=dense)[:OF_MODES]
         found = polish(task.richer, task.rough, signed, (ROUGH,), 6)[:2]
-        starts += coarse(larger, task.rough, _by_name(task, found))
+        starts += coarse(larger, task.rough, _named_starts(task, found))
     led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
     return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
 
@@ -227,8 +226,8 @@ def canonical(fit: Fit, data: Dataset) -> Fit:
     for effect in structure.effects:
         if not fit.converged or effect.restated(plain) is None:
             continue
-        named = effect.from_restated(plain, effect.to_restated(plain, fit.values))
-        theta = _with_named(fit, effect, named)
+        p = {**fit.values, **effect.to_restated(plain, fit.values)}
+        theta = by_name(effect, structure, p)
         if np.allclose(theta, fit.theta, rtol=1e-9, atol=1e-12):
             continue
         renamed = fit_orbits(structure, data, theta, continuation=(0.0,))
@@ -238,13 +237,13 @@ def canonical(fit: Fit, data: Dataset) -> Fit:
     return fit
 
 
-def _with_named(fit: Fit, effect: Effect, values: Sequence[float]) -> FloatArray:
-    """Unknowns of `fit` with these values of the declared model and of one effect, in order."""
-    plain = replace(fit.structure, effects=())
+def by_name(effect: Effect, larger: Structure, p: Mapping[str, float]) -> FloatArray:
+    """Unknowns of `larger`, of which `effect` is one, from values of the richer structure that says
+    the same as the declared model with it, and of what else is in `larger`."""
+    plain = replace(larger, effects=())
     names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
-    now = {**fit.values, **dict(zip(names, values, strict=True))}
-    parameters = fit.structure.parameters
-    return parameters.to_internal([now[n] for n in parameters.names])
+    now = {**p, **dict(zip(names, effect.from_restated(plain, p), strict=True))}
+    return larger.parameters.to_internal([now[n] for n in larger.parameters.names])
 
 
 def shares_of(base: Fit, data: Dataset) -> tuple[float, float, float]:
@@ -403,7 +402,7 @@ def _restated_starts(t: Tried, clean: Dataset) -> list[FloatArray]:
         richer = effect.restated(plain)
         if richer is not None:
             found = [richer.parameters.plain(theta) for theta in candidates(richer, clean)]
-            return [_with_named(t.fit, effect, effect.from_restated(plain, p)) for p in found]
+            return [by_name(effect, t.fit.structure, {**t.fit.values, **p}) for p in found]
     return []
 
 

@@ -80,14 +80,8 @@ class Tried:
         values = {name: e.value for name, e in known.items()}
         inside = all(q.plausible(values[q.name]) for e in self.effects for q in e.parameters)
         seen = all(known[n].stderr < abs(values[n]) for e in self.effects for n in e.located)
-        return (
-            inside
-            and seen
-            and all(
-                values[f"mode{i}.damping"] < 0.7
-                for i in range(1, self.fit.structure.mode_count + 1)
-            )
-        )
+        modes = range(1, self.fit.structure.mode_count + 1)
+        return inside and seen and all(values[f"mode{i}.damping"] < 0.7 for i in modes)
 
 
 def _evidence(fit: Fit, more: int = 0) -> float:
