@@ -215,6 +215,10 @@ def test_linear_forms_are_what_they_say() -> None:
     alone = by_key("actuator_dynamics:resonance").actuator(values, NOWHERE, S)
     both = by_key("actuator_dynamics:resonance_pole").actuator(values, NOWHERE, S)
     np.testing.assert_allclose(both, alone / (1 + 3e-4 * S))
+    coupled = by_key("actuator_dynamics:highpass").actuator(
+        {"actuator_dynamics.corner_hz": 60.0}, NOWHERE, S
+    )
+    np.testing.assert_allclose(coupled, 1 / (1 + 2 * np.pi * 60.0 / S))
 
 
 def test_an_amplifier_s_crossover() -> None:

@@ -60,6 +60,22 @@ class VoiceCoil(Effect):
         return 1.0 / (s * p["actuator_dynamics.time_s"] + 1.0)
 
 
+class Coupling(Effect):
+    """An amplifier that passes no direct voltage: a first-order high-pass, s/(s + ω)."""
+
+    name, location, form = "actuator_dynamics", "actuator", "highpass"
+    parameters = (Parameter("actuator_dynamics.corner_hz", "Hz", 0.0, 1e3, scale=10.0),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.03 * known.free_hz,), (0.3 * known.free_hz,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        return s / (2 * np.pi * p["actuator_dynamics.corner_hz"] + s)
+
+
 class LaggingResonance(Effect):
     """A second-order speaker behind a first-order lag: its resonance and its coil, or a plenum."""
 
@@ -220,6 +236,7 @@ EFFECTS: tuple[Effect, ...] = (
     SpeakerResonance("resonance"),
     SpeakerResonance("acceleration"),
     VoiceCoil(),
+    Coupling(),
     LaggingResonance(),
     ActuatorDelay(),
     Distortion((2,)),
