@@ -219,6 +219,10 @@ def test_linear_forms_are_what_they_say() -> None:
         {"actuator_dynamics.corner_hz": 60.0}, NOWHERE, S
     )
     np.testing.assert_allclose(coupled, 1 / (1 + 2 * np.pi * 60.0 / S))
+    heard = by_key("sensor_dynamics:highpass").sensor(
+        {"sensor_dynamics.corner_hz": 60.0}, NOWHERE, S, np.full_like(S, 2.0)
+    )
+    np.testing.assert_allclose(heard, 2 * coupled)
 
 
 def test_an_amplifier_s_crossover() -> None:

@@ -177,6 +177,22 @@ class SensorLag(Effect):
         return y / (s * p["sensor_dynamics.time_s"] + 1.0)
 
 
+class SensorCoupling(Effect):
+    """Both microphones pass no direct voltage: a first-order high-pass, s/(s + ω)."""
+
+    name, location, form = "sensor_dynamics", "sensor", "highpass"
+    parameters = (Parameter("sensor_dynamics.corner_hz", "Hz", 0.0, 1e3, scale=10.0),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.03 * known.free_hz,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        return y * (s / (2 * np.pi * p["sensor_dynamics.corner_hz"] + s))
+
+
 EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("gain"),
     ChannelMismatch("skew"),
@@ -191,4 +207,5 @@ EFFECTS: tuple[Effect, ...] = (
     ModalOffset(3),
     ModalOffset(4),
     SensorLag(),
+    SensorCoupling(),
 )
