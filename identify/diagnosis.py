@@ -273,7 +273,7 @@ def _judge(
         if not others:
             open_ = trace.other_forms(best, good)
             forms = [
-                f" Its form, {', '.join([e.form, *open_[e.name]])}, is not decided by them."
+                f" Forms of {e.name} that do as well: {', '.join(open_[e.name])}."
                 for e in best.effects
                 if open_[e.name]
             ]

@@ -91,8 +91,9 @@ def in_other_forms(
 ) -> list[Tried]:
     """The other forms of the effects of the best of `tries`, started from where it ended.
 
-    A form with one parameter less may do as well, and is then what should be named; where none
-    explains the data, another may be nearer to the truth than the one that was refitted first.
+    A form with one parameter less may do as well, and is then what should be named (of several
+    effects that explain the data, no other forms are tried); where none explains the data, another
+    may be nearer to the truth than the one that was refitted first.
     """
     good = [t for t in tries if t.explains]
     best = min(good, key=lambda t: t.evidence) if good else min(tries, key=misfit, default=None)
@@ -120,6 +121,7 @@ def _each_in_other_forms(
                 if form.name == e.name
                 and form.key != e.key
                 and not (form.refines and t.explains)
+                and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
                 and key_of_forms((*kept, form)) not in done
             ]
     items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for

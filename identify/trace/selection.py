@@ -213,6 +213,8 @@ class _Searching:
             certain = [t for t in self.tried if t.spread is None]
             self.tried += reformed(certain, data, self.available, run, self.done)
         several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
+        if any(t.explains for t in several):
+            self.tried += in_other_forms(several, data, self.available, run)
         near = at_the_same_place(several, data, self.available, run)
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
