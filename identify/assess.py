@@ -56,6 +56,7 @@ class Prediction:
 
 def predict(structure: Structure, theta: FloatArray, batch: Batch) -> Prediction:
     """Steady states of a batch with derivatives, followed from the measurement."""
+    batch = batch.balanced(structure)
     with np.errstate(all="ignore"):
         orbits = balance.solve(structure, theta, batch.at, derivatives=True)
         residual, jacobian = compare(batch, orbits)
@@ -224,7 +225,7 @@ def _model_cycle(fit: Fit, data: Dataset, fitted: Sequence[Prediction]) -> Limit
         if free is None:
             return None
         found = predict(fit.structure, fit.theta, free)
-        orbits, batch = found.orbits, free
+        orbits, batch = found.orbits, found.batch
         if not orbits.converged[0]:
             return None
     y = np.abs(orbits.velocity[0, : batch.compared])

@@ -34,7 +34,7 @@ IntArray = npt.NDArray[np.int64]
 
 TOLERANCE = 1e-10  # relative Newton residual: far below any noise, above rounding
 MAX_ITERATIONS = 12  # Newton steps; twice as many where ω is an unknown too
-FINE = 512  # samples a period of a `Preceded` characteristic: turning points to 2e-5 of the swing
+FINE = 1024  # samples a period of a `Preceded` characteristic: turning points to 5e-6 of the swing
 
 
 @lru_cache(maxsize=32)

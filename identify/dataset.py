@@ -17,12 +17,13 @@ import numpy.typing as npt
 
 from identify.harmonics import Harmonics, Microphones
 from identify.record import Medium
-from identify.structure import Conditions
+from identify.structure import Conditions, Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 
-EXTRA_HARMONICS = 6  # balanced beyond those compared, so that truncation stays below the noise
+EXTRA_HARMONICS = 6  # balanced beyond those compared, so that truncation stays below the noise …
+CORNERS_HARMONICS = 20  # … and of a structure with corners, whose harmonics fall off slowly
 
 
 @dataclass(frozen=True)
@@ -89,6 +90,12 @@ class Batch:
             covariance=covariance,
             whitener=np.stack([whitener(c) for c in covariance]),
         )
+
+    def balanced(self, structure: Structure) -> "Batch":
+        """The same with as many harmonics as the structure needs to be solved for."""
+        if not structure.cornered:
+            return self
+        return replace(self, at=self.at.padded(self.compared + CORNERS_HARMONICS))
 
     def tile(self, times: int) -> "Batch":
         """All runs repeated `times` times, for as many parameter vectors at once."""

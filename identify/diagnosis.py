@@ -192,13 +192,14 @@ def _declared(
     assessment = assess.assess(fit, data)
     usable = [e for e in catalogue if trace.usable(e, data, structure)] if fit.converged else []
     scores = trace.score_tests(structure, data, fit, usable, executor)
-    held = _validation_p(assessment, data)
-    p_value = min(
+    tests = [
         assess.lack_of_fit_p(fit.chi2, fit.dof),
-        held if np.isfinite(held) else 1.0,
+        _validation_p(assessment, data),
         trace.family_p(list(scores.values())),
-    )
-    return _Declared(fit, assessment, scores, p_value)
+    ]
+    taken = [p for p in tests if np.isfinite(p)]
+    # the least of so many: corrected for that (Bonferroni)
+    return _Declared(fit, assessment, scores, min(1.0, len(taken) * min(taken)))
 
 
 def _validation_p(before: Assessment, data: Dataset) -> float:

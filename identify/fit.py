@@ -493,13 +493,12 @@ def fit_orbits(
     Each is led in by decreasing `continuation` shares, the last of which must be 0.
     """
     current = np.atleast_2d(thetas)
+    batches = [b.balanced(structure) for b in data.fit]
     reason = "the harmonic balance has no solution at the start"
     best: Descent | None = None
     for share in continuation:
         last = share == 0
-        residual = OrbitResidual(
-            structure, soften(data.fit, share), None if last else LEAD_IN_STEPS
-        )
+        residual = OrbitResidual(structure, soften(batches, share), None if last else LEAD_IN_STEPS)
         straight = Straightened(residual, structure)
         descents = levenberg_marquardt(
             straight,

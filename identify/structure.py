@@ -78,17 +78,19 @@ class Conditions:
         """All runs repeated `times` times, for as many parameter vectors at once."""
         return self.take(np.tile(np.arange(self.runs), times)) if times > 1 else self
 
+    def padded(self, harmonics: int) -> "Conditions":
+        """The same with columns of zeros up to so many harmonics, where there are fewer."""
+        missing = ((0, 0), (0, max(harmonics - self.harmonics, 0)))
+        wide: dict[str, Any] = {n: np.pad(getattr(self, n), missing) for n in BY_HARMONIC}
+        return replace(self, **wide)
+
     def joined(self, other: "Conditions") -> "Conditions":
         """These runs, then the other's, with as many harmonics as either has."""
         K = max(self.harmonics, other.harmonics)
-
-        def wide(c: ComplexArray) -> ComplexArray:
-            return np.pad(c, ((0, 0), (0, K - c.shape[1])))
-
-        rows = {n: (getattr(self, n), getattr(other, n)) for n in BY_RUN}
-        for n in BY_HARMONIC:
-            rows[n] = wide(getattr(self, n)), wide(getattr(other, n))
-        joined: dict[str, Any] = {n: np.concatenate(pair) for n, pair in rows.items()}
+        pair = self.padded(K), other.padded(K)
+        joined: dict[str, Any] = {
+            n: np.concatenate([getattr(c, n) for c in pair]) for n in (*BY_RUN, *BY_HARMONIC)
+        }
         return replace(self, **joined)
 
 
@@ -321,6 +323,11 @@ class Structure:
     def parameters(self) -> ParameterSet:
         own = [p for e in self.effects for p in e.parameters]
         return ParameterSet((*self.base_parameters, *own))
+
+    @cached_property
+    def cornered(self) -> bool:
+        """Whether corners or memory precede the characteristic: harmonics then fall off slowly."""
+        return any(type(e).operator is not Effect.operator for e in self.effects)
 
     def with_effects(self, *effects: Effect) -> "Structure":
         return replace(self, effects=(*self.effects, *effects))
