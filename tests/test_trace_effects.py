@@ -14,7 +14,7 @@ from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import Fit
+from identify.fit import Fit, fit_orbits
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.report.gallery import save_figures
@@ -26,6 +26,7 @@ from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import scan
 from identify.trace.selection import against_chance, try_scatters
 from identify.trace.stages import known_sizes
+from identify.trace.tried import tried
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import EFFECTS, make_effect
@@ -211,6 +212,24 @@ def test_corners_are_solved_with_more_harmonics(tmp_path: Path, form: str) -> No
     assert many < 1e-5 < few
     again = batch.balanced(structure)
     assert again.balanced(structure).at.harmonics == again.at.harmonics > batch.at.harmonics
+
+
+def test_what_would_be_claimed_is_tried_without_its_effect(tmp_path: Path) -> None:
+    """Also where sets that take more away, and lead nowhere, stand before it."""
+    ready, base = recorded(tmp_path, 3, "")
+    larger = ready.structure.with_effects(by_key("nonlinearity_shape:quintic"))
+    fit = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0], continuation=(0.0,))
+    claimed = tried(larger.effects, fit, ready.data)
+    assert claimed.explains
+    nowhere = replace(
+        claimed,
+        fit=replace(fit, chi2=0.5 * fit.chi2, theta=np.full_like(fit.theta, np.nan)),
+        fit_p=0.0,
+    )
+    assert trace.without_effects(ready.structure, ready.data, [nowhere] * 4) is None
+    found = trace.without_effects(ready.structure, ready.data, [*[nowhere] * 4, claimed])
+    assert found is not None
+    assert found.chi2 == pytest.approx(base.chi2, abs=1e-3)
 
 
 def test_a_noisy_record_of_the_drive_is_no_discovery(tmp_path: Path) -> None:

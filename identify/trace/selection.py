@@ -331,7 +331,8 @@ def _scattered(item: tuple[Structure, Dataset, Fit, Scatter]) -> Spread | None:
 
 
 def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:
-    """The declared model fitted from where the best of `tries` ended, their effects left out.
+    """The declared model fitted from where the best of `tries` ended, their effects left out, and
+    from what would be claimed.
 
     None where nothing finite comes of it. Several effects that do equally well are often a sign
     that the declared fit itself had ended in the wrong minimum.
@@ -340,6 +341,8 @@ def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried])
     best = sorted((t for t in tries if np.isfinite(t.fit.chi2)), key=misfit)[:4]
     if not best:
         return None
+    good = [t for t in tries if t.explains]
+    best += [best_form(good)] if good else []
     thetas = np.stack([t.fit.theta[:count] for t in best])
     fit = fit_orbits(structure, data, thetas, continuation=(0.003, 0.0))
     return fit if np.isfinite(fit.chi2) else None
