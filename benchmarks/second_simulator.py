@@ -2,13 +2,17 @@
 
     python benchmarks/second_simulator.py                      every effect by itself, and pairs
     python benchmarks/second_simulator.py flame_delay/0.8ms    those named; joined by +: together
+    python benchmarks/second_simulator.py --drawn 58           effect by effect, of any size
+    python benchmarks/second_simulator.py --drawn 40 --pairs --first 1000    two at a time
     python benchmarks/second_simulator.py --out DIR            the folders are kept there
 
 The thesis's tube of four modes (Tables 4.1, 4.2, 4.7), of which two are declared, by plain
 Runge–Kutta; runs and noise as in recorded campaigns (2 s at 10 kHz, int16, 1.7e-4 of the
 velocity). It shares nothing with the simulated rig, and its effects are written as another hand
 would: a damping of one mode that drifts, a flame that leads, losses in one mode alone, a warming
-that settles. Prints, for each, the verdict, what is claimed, χ²/dof before and after, and seconds.
+that settles. Those that are drawn have random sizes, from hardly visible to gross, in another tube
+each and at 0.15 to 6 times the noise. Prints, for each, the verdict, what is claimed, χ²/dof before
+and after, and seconds.
 """
 
 import argparse
@@ -93,6 +97,7 @@ class Tube:
     drift: Callable[["Tube", float], "Tube"] | None = None  # at a share of the campaign
     modulation: float = 0.0
     drive_scatter: tuple[float, float] = (0.0, 0.0)  # relative, rad
+    noise_pa: float = NOISE_PA
 
 
 @numba.njit(cache=True)
@@ -206,7 +211,7 @@ def record(tube: Tube, frequency_hz: float, volts: float, rng: np.random.Generat
         pressures[1] = np.fft.irfft(spectrum, count)
     t = np.arange(count)[::STEPS] * H
     rumble = 0.3 * lfilter([1], [1, -0.95], rng.standard_normal(t.size))
-    out = [p[::STEPS] + NOISE_PA * (rumble + rng.standard_normal(t.size)) for p in pressures]
+    out = [p[::STEPS] + tube.noise_pa * (rumble + rng.standard_normal(t.size)) for p in pressures]
     for hz, size in tube.tones:
         out = [p + size * np.sin(TWO_PI * (hz * t + rng.uniform())) for p in out]
     return np.stack([*out, volts * np.sin(omega * t)], axis=1)
@@ -347,6 +352,119 @@ PAIRS = (
 )
 
 
+Random = np.random.Generator
+
+
+def _size(rng: Random, low: float, high: float) -> float:
+    """Any size between, by its logarithm."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _signed(rng: Random, low: float, high: float) -> float:
+    return float(rng.choice([-1.0, 1.0])) * _size(rng, low, high)
+
+
+def _drawn_lead(rng: Random) -> Numbers:
+    zero = _size(rng, 500, 2000)
+    return _lead(zero, zero * _size(rng, 2, 6))
+
+
+def _drawn_hum(rng: Random) -> tuple[tuple[float, float], ...]:
+    size = _size(rng, 0.3, 8)
+    return ((50.0, size), (150.0, 0.3 * size))
+
+
+def _lag_of(hz: float) -> Callable[[complex], complex]:
+    return lambda s: 1 / (1 + s / (TWO_PI * hz))
+
+
+def _delay_of(seconds: float) -> Callable[[complex], complex]:
+    return lambda s: complex(np.exp(-seconds * s))
+
+
+def _highpass_of(hz: float) -> Callable[[complex], complex]:
+    return lambda s: s / (s + TWO_PI * hz)
+
+
+def _limited(level: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda v: level * np.tanh(v / level)
+
+
+def _bent(size: float, power: int) -> Callable[[FloatArray], FloatArray]:
+    return lambda v: v + size * v**power
+
+
+def _other_gain(gain: float, skew_s: float = 0.0) -> Callable[[FloatArray], Any]:
+    return lambda f: (1 + gain) * np.exp(2j * np.pi * skew_s * f)
+
+
+DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
+    "acoustic_mode/third": lambda r: {"modes": 3},
+    "acoustic_mode/two": lambda r: {"modes": 4},
+    "nonlinear_damping/first_quadratic": lambda r: {"loss": (_size(r, 5e-8, 1.5e-6), 2, False)},
+    "nonlinear_damping/first_cubic": lambda r: {"loss": (_size(r, 1e-14, 3e-13), 3, False)},
+    "nonlinear_damping/velocity": lambda r: {"loss": (_size(r, 5e-6, 1e-4), 2, True)},
+    "flame_delay": lambda r: {"delay_s": _size(r, 3e-5, 1.5e-3)},
+    "flame_dynamics/pole": lambda r: {"flame_filter": _lag(_size(r, 400, 5000))},
+    "flame_dynamics/lead": lambda r: {"flame_filter": _drawn_lead(r)},
+    "flame_dynamics/second_order": lambda r: {
+        "flame_filter": _second(_size(r, 300, 900), _size(r, 0.2, 0.8))
+    },
+    "nonlinearity_shape/quintic": lambda r: {"powers": (*BASE.powers[:3], -_size(r, 1e-17, 6e-16))},
+    "nonlinearity_shape/tanh": lambda r: {"saturation": _size(r, 1.5e4, 1e5)},
+    "nonlinearity_shape/quadratic_odd": lambda r: {"quadratic_odd": _signed(r, 2e-5, 4e-4)},
+    "actuator_dynamics/resonance": lambda r: {
+        "speaker": _resonance(_size(r, 90, 900), _size(r, 0.1, 0.5))
+    },
+    "actuator_dynamics/pole": lambda r: {"speaker": _lag_of(_size(r, 100, 2000))},
+    "actuator_dynamics/delay": lambda r: {"speaker": _delay_of(_size(r, 1e-4, 3e-3))},
+    "actuator_dynamics/highpass": lambda r: {"speaker": _highpass_of(_size(r, 20, 150))},
+    "actuator_nonlinearity/tanh": lambda r: {"drive": _limited(_size(r, 2, 8))},
+    "actuator_nonlinearity/quadratic": lambda r: {"drive": _bent(_signed(r, 0.005, 0.1), 2)},
+    "actuator_nonlinearity/cubic": lambda r: {"drive": _bent(_signed(r, 0.002, 0.04), 3)},
+    "channel_mismatch/gain": lambda r: {"upper_microphone": _other_gain(_signed(r, 2e-3, 0.04))},
+    "channel_mismatch/skew": lambda r: {
+        "upper_microphone": _other_gain(0.0, _signed(r, 1e-6, 4e-5))
+    },
+    "channel_mismatch/both": lambda r: {
+        "upper_microphone": _other_gain(_signed(r, 2e-3, 0.04), _signed(r, 1e-6, 4e-5))
+    },
+    "sensor_offset": lambda r: {"measured": _offset(_signed(r, 0.01, 0.08))},
+    "interference/mains": lambda r: {"tones": _drawn_hum(r)},
+    "parameter_drift/frequency": lambda r: {
+        "drift": _course("frequency_hz", _signed(r, 3e-4, 1e-2))
+    },
+    "parameter_drift/damping": lambda r: {"drift": _course("damping", _signed(r, 0.01, 0.2))},
+    "parameter_drift/flame_input": lambda r: {
+        "drift": _course("flame_gain", _signed(r, 2e-3, 0.1))
+    },
+    "parameter_drift/speaker": lambda r: {"drift": _course("at_speaker", _signed(r, 3e-3, 0.1))},
+    "none": lambda r: {},
+}
+
+
+def drawn(seed: int, pairs: bool) -> tuple[str, Tube]:
+    """One effect, by turns, or any two, of random size in a tube of its own."""
+    rng = np.random.default_rng([seed, 99])
+    some = [k for k in DRAWN if k != "none"]
+    keys = [*rng.choice(some, 2, replace=False)] if pairs else [list(DRAWN)[seed % len(DRAWN)]]
+    changes: dict[str, Any] = {}
+    for key in keys:
+        changes |= DRAWN[str(key)](rng)
+    first, *others = BASE.damping
+    tube = replace(
+        BASE,
+        damping=(first * rng.uniform(0.8, 1.15), *(d * rng.uniform(0.6, 1.4) for d in others)),
+        frequency_hz=(
+            BASE.frequency_hz[0], *(f * rng.uniform(0.97, 1.03) for f in BASE.frequency_hz[1:])
+        ),
+        flame_gain=BASE.flame_gain * rng.uniform(0.92, 1.15),
+        flame_rate=BASE.flame_rate * rng.uniform(0.8, 1.25),
+    )  # fmt: skip
+    tube = replace(tube, **changes)
+    return "+".join(map(str, keys)), replace(tube, noise_pa=NOISE_PA * _size(rng, 0.15, 6))
+
+
 def with_effects(key: str) -> Tube:
     """The tube with the effects of that name, joined by +."""
     tube = BASE
@@ -372,11 +490,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("effects", nargs="*", default=[*EFFECTS, *PAIRS])
     parser.add_argument("--out", type=Path)
+    parser.add_argument("--drawn", type=int, help="so many of random sizes in place of those named")
+    parser.add_argument("--pairs", action="store_true", help="of those drawn: two at a time")
+    parser.add_argument("--first", type=int, default=0, help="of those drawn: the first seed")
     options = parser.parse_args()
+    if options.drawn is None:
+        made = [(key, with_effects(key), 100 + i) for i, key in enumerate(options.effects)]
+    else:
+        seeds = range(options.first, options.first + options.drawn)
+        made = [(*drawn(seed, options.pairs), 5000 + seed) for seed in seeds]
     with tempfile.TemporaryDirectory() as temporary, executor(2) as run:
-        for i, key in enumerate(options.effects):
-            folder = (options.out or Path(temporary)) / key.replace("/", "_")
-            write(with_effects(key), folder, 100 + i, key)
+        for key, tube, seed in made:
+            name = key.replace("/", "_") + (f"_{seed}" if options.drawn else "")
+            folder = (options.out or Path(temporary)) / name
+            write(tube, folder, seed, key)
             recorded = load_campaign(open_campaign(folder))
             begin = time.monotonic()
             found = identify.diagnose(recorded, executor=run).to_json()
