@@ -197,7 +197,6 @@ def _batch(
             row[: min(K, v.size)] = v[:K]
         return out
 
-    geometry = {} if mics is None else {"centre_m": mics.centre_m}
     at = Conditions(
         omega=2 * np.pi * np.array([h.frequency_hz for h in hs]),
         drive=pad([h.drive for h in hs]),
@@ -210,8 +209,9 @@ def _batch(
         spacing_m=np.full(len(hs), np.nan if mics is None else mics.spacing_m),
         density_kg_m3=medium.density_kg_m3,
         sound_speed_m_s=medium.sound_speed_m_s,
-        **geometry,
     )
+    if mics is not None:
+        at = replace(at, centre_m=mics.centre_m)
     limited = [h.limited(count) for h in hs]
     measured = np.stack([h.velocity for h in limited])
     covariance = np.stack([h.covariance for h in limited])

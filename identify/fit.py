@@ -244,6 +244,30 @@ class OrbitResidual:
         return np.concatenate(inputs, axis=1), np.concatenate(omegas)
 
 
+class Pulled:
+    """A residual with more rows that pull linear combinations of the unknowns towards targets.
+
+    `rows` (pulls, p), in units of one standard deviation each; `targets` (descents, pulls), zero
+    where none are given.
+    """
+
+    def __init__(
+        self, inner: Residual, rows: FloatArray, targets: FloatArray | None = None
+    ) -> None:
+        self.inner, self.rows, self.targets = inner, rows, targets
+
+    def __call__(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated:
+        found = self.inner(thetas, which, jacobian)
+        pull = thetas @ self.rows.T
+        if self.targets is not None:
+            pull = pull - self.targets[which]
+        residual = np.concatenate([found.residual, pull], axis=1)
+        if found.jacobian is None:
+            return Evaluated(residual, None, found.exists)
+        more = np.broadcast_to(self.rows, (thetas.shape[0], *self.rows.shape))
+        return Evaluated(residual, np.concatenate([found.jacobian, more], axis=1), found.exists)
+
+
 class Straightened:
     """The same residual in unknowns u in which its long valley is straight.
 

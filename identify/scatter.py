@@ -1,18 +1,18 @@
 """Maximum likelihood with random differences from run to run.
 
 A run draws its own x_r ~ N(0, diag σ²) along the directions that an
-`identify.effects.scatter.Scatter` names. Let ρ_r(θ, x) be its whitened residuals and x̂_r the
-likeliest x for now. With the tangents T_r and J_r taken there, and e_r = ρ_r(θ, x̂_r) − T_r x̂_r,
+`identify.effects.scatter.Scatter` names. Let ρ_r(θ, x) be its whitened residuals; for given σ, θ
+and the likeliest x̂_r are found together (`identify.own`). With the tangents T_r and J_r taken
+there, and e_r = ρ_r(θ, x̂_r) − T_r x̂_r,
 
     e_r + J_r δθ ~ N(0, V_r),    V_r = I + T_r diag(σ²) T_rᵀ,
     −2 ln L(θ, σ) = Σ_r e_rᵀ V_r⁻¹ e_r + ln det V_r + const.
 
 σ comes from the restricted likelihood (δθ profiled out, + ln det Σ Jᵀ V⁻¹ J): θ has many numbers,
-and what they absorb of the runs' deviations must not pass for their smallness. θ for given σ is an
-ordinary fit with widened covariances, to data from which what is not linear in x̂_r has been taken
-off; the two alternate. ln det V is what the freedom costs: a spread never explains for nothing what
-a law explains. A spread must also look random (`identify.randomness`): what follows the runs'
-conditions or time, or sits in a single run, has another cause.
+and what they absorb of the runs' deviations must not pass for their smallness. The two alternate.
+ln det V is what the freedom costs: a spread never explains for nothing what a law explains. A
+spread must also look random (`identify.randomness`): what follows the runs' conditions or time, or
+sits in a single run, has another cause.
 """
 
 from collections.abc import Sequence
@@ -26,23 +26,32 @@ from identify import assess
 from identify.chances import rank_correlation
 from identify.dataset import Batch, Dataset
 from identify.effects.scatter import Scatter
-from identify.fit import Fit, fit_orbits
+from identify.fit import Fit, covariance_of
+from identify.own import Led, Own, lead, settle
 from identify.parameters import Estimate
 from identify.randomness import law_in
+from identify.start import distant_starts
 from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.intp]
+IntArray = npt.NDArray[np.int64]
 
 ROUNDS = 8
-STEPS = 3  # Gauss–Newton steps to a run's likeliest deviation
 LEAST_RUNS = 6  # forced runs below which a spread says nothing
 SQUARED = " squared"
 TREND_P = 0.003  # a rank correlation less probable than this is a law, not chance
 ONE_RUN = 0.9  # share of all deviation that a single run may hold
 SMALLEST = 1e-8
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
-HOPELESS = 5.0  # χ²/dof after three rounds that further ones do not mend
+LEADING = 10.0  # typical sizes of each direction that the lead-in allows
+ASTRAY = 300.0  # χ²/dof beyond which the base fit is no place to start from alone
+#: How they are led in: harmonics, share of noise, Newton steps, and how many are kept.
+STAGES = (
+    ("coarse", 0.1, 2, 24),
+    ("coarse", 0.02, 2, 16),
+    ("all", 0.003, 3, 8),
+    ("all", 0.0005, 3, 4),
+)
 
 
 @dataclass(frozen=True)
@@ -67,114 +76,143 @@ class _Rows:
 
 
 def fit_scatter(structure: Structure, data: Dataset, base: Fit, scatter: Scatter) -> Spread | None:
-    """Fit `structure` with a scatter on top.
+    """Fit `structure` with a scatter on top, from the fit `base` without it, and from the slow flow
+    where that one is no place to start from.
 
     None where there are too few runs, or no likelihood that is finite.
     """
     forced = sum(b.runs for b in data.fit if not b.free)
     if forced < LEAST_RUNS or not np.isfinite(base.chi2):
         return None
-    try:
-        return _alternate(structure, data, base, scatter)
-    except np.linalg.LinAlgError:  # V is singular to rounding: σ beyond all measure
-        return None
+    own = Own(scatter.directions, _reached(data.fit, scatter))
+    starts = [_near(structure, base, own)]
+    if base.chi2_per_dof > ASTRAY:
+        starts.append(_afar(structure, data, own, base))
+    found = []
+    for begin in starts:
+        try:
+            spread = _alternate(structure, data, own, begin, scatter)
+        except np.linalg.LinAlgError:  # V is singular to rounding: σ beyond all measure
+            spread = None
+        if spread is not None:
+            found.append(spread)
+    return min(found, key=lambda spread: spread.fit.chi2 + spread.penalty, default=None)
 
 
-def _alternate(structure: Structure, data: Dataset, base: Fit, scatter: Scatter) -> Spread | None:
-    fit, sizes = base, np.full(len(scatter.parameters), 0.01)
-    rows = [_rows(structure, fit.theta, b, scatter) for b in data.fit]
-    wide = data
-    if not _finite(rows):
-        return None
-    for i in range(ROUNDS):
-        found = _sizes(rows, sizes)
-        settled = bool(i) and bool(np.allclose(found, sizes, rtol=0.01, atol=1e-6))
-        sizes = found
-        wide = replace(data, fit=tuple(_widen(r, sizes) for r in rows))
-        # the declared fit may lie far off, misled by runs that it took at their word
-        lead_in = (0.0,) if i else (0.01, 0.001, 0.0)
-        fit = fit_orbits(structure, wide, fit.theta, continuation=lead_in, iterations=150)
-        if not np.isfinite(fit.chi2) or (i >= 2 and fit.chi2_per_dof > HOPELESS):
+def _reached(batches: Sequence[Batch], scatter: Scatter) -> IntArray:
+    """Identities of the runs that may deviate: without a drive there is none to scatter."""
+    reached = [b.at.identity for b in batches if not (b.free and scatter.location == "actuator")]
+    return np.concatenate([np.empty(0, dtype=np.int64), *reached])
+
+
+def _guess(own: Own) -> FloatArray:
+    """σ that leads in: wide, but not so wide that any θ would do."""
+    return np.array([LEADING * d.scale for d in own.directions])
+
+
+def _near(structure: Structure, base: Fit, own: Own) -> FloatArray:
+    return np.concatenate([base.theta, np.zeros(len(own.parameters))])[None]
+
+
+def _afar(structure: Structure, data: Dataset, own: Own, base: Fit) -> FloatArray:
+    """Starts from the slow flow wherever the base fit is, led through falling noise."""
+    rough = data.coarse()
+    inherited = [base.values[q.name] for e in structure.effects for q in e.parameters]
+    begun = distant_starts(structure, rough, inherited)
+    none = np.zeros(len(own.parameters))
+    thetas = np.stack([np.r_[s.theta, none] for s in begun] + [np.r_[base.theta, none]])
+    for seen, share, steps, kept in STAGES:
+        batches = rough.fit if seen == "coarse" else data.fit
+        led = lead(
+            structure, own, batches, thetas, _guess(own), share=share, steps=steps, iterations=20
+        )
+        if not led:
+            break
+        thetas = np.stack([np.r_[x.theta, x.own] for x in led[:kept]])
+    return thetas
+
+
+def _alternate(
+    structure: Structure, data: Dataset, own: Own, starts: FloatArray, scatter: Scatter
+) -> Spread | None:
+    sizes, settled = _guess(own), False
+    for _ in range(ROUNDS):
+        found = lead(structure, own, data.fit, starts, sizes)
+        if not found:
             return None
-        rows = _placed(structure, fit.theta, data.fit, scatter, sizes)
+        led = found[0]
+        rows = [_rows(structure, led.theta, own.placed(b, led.own), scatter) for b in data.fit]
         if not _finite(rows):
             return None
+        starts = np.r_[led.theta, led.own][None]
+        before, sizes = sizes, _sizes(rows, sizes)
+        settled = bool(np.allclose(sizes, before, rtol=0.01, atol=1e-6))
         if settled:
             break
     errors = _relative_errors(rows, sizes)
     # a spread known from a dozen runs is itself uncertain: held-out runs get its upper end
     upper = sizes * np.exp(UPPER * np.minimum(errors, 1.0))
-    held = _placed(structure, fit.theta, data.validation, scatter, upper)
-    wide = replace(wide, validation=tuple(_widen(r, upper) for r in held))
+    wide = replace(
+        data,
+        fit=tuple(_widen(r, sizes) for r in rows),
+        validation=tuple(
+            _widen(_held_out(structure, led.theta, b, scatter, upper), upper)
+            for b in data.validation
+        ),
+    )
     named = {
         q.name: Estimate(float(s), float(s * e), q.unit)
         for q, s, e in zip(scatter.parameters, sizes, errors, strict=True)
     }
+    fit = _fit(structure, led, rows, sizes)
     return Spread(fit, wide, named, _penalty(rows, sizes), _objection(rows, sizes, scatter))
 
 
-def _placed(
-    structure: Structure,
-    theta: FloatArray,
-    batches: Sequence[Batch],
-    scatter: Scatter,
-    sizes: FloatArray,
-) -> list[_Rows]:
-    """The rows of all batches at their runs' likeliest deviations."""
-    at_zero = [_rows(structure, theta, b, scatter) for b in batches]
-    return [_moved(structure, theta, r, scatter, sizes) for r in at_zero]
+def _fit(structure: Structure, led: Led, rows: Sequence[_Rows], sizes: FloatArray) -> Fit:
+    """θ's fit under the widened covariances."""
+    factors = [np.linalg.cholesky(_spread(r, sizes)) for r in rows]
+    pairs = list(zip(factors, rows, strict=True))
+    residual = np.concatenate([np.linalg.solve(L, r.residual[..., None]).ravel() for L, r in pairs])
+    jacobian = np.concatenate(
+        [np.linalg.solve(L, r.jacobian).reshape(-1, led.theta.size) for L, r in pairs]
+    )
+    return Fit(
+        structure,
+        led.theta,
+        float(residual @ residual),
+        residual.size - led.theta.size,
+        covariance_of(jacobian),
+        residual,
+        jacobian,
+        led.converged,
+        led.reason,
+        led.iterations,
+    )
 
 
-def _rows(
-    structure: Structure,
-    theta: FloatArray,
-    batch: Batch,
-    scatter: Scatter,
-    x: FloatArray | None = None,
+def _held_out(
+    structure: Structure, theta: FloatArray, batch: Batch, scatter: Scatter, sizes: FloatArray
 ) -> _Rows:
-    """Residuals and tangents at deviations `x` (runs, q); None: at none."""
+    """The rows of runs that θ was not fitted to, at their own likeliest deviations."""
+    own = Own(scatter.directions, _reached([batch], scatter), absorbed=False)
+    led = settle(structure, own, theta, batch, sizes)
+    return _rows(structure, theta, batch if led is None else own.placed(batch, led.own), scatter)
+
+
+def _rows(structure: Structure, theta: FloatArray, batch: Batch, scatter: Scatter) -> _Rows:
+    """e and the tangents, at the deviations that the batch's runs are known to have."""
     larger = structure.with_effects(*scatter.directions)
-    scale = np.array([e.parameters[0].scale for e in scatter.directions])
+    scale = np.array([d.scale for d in scatter.directions])
     p = theta.size
-    if x is None:
-        found = assess.predict(larger, np.r_[theta, np.zeros(scale.size)], batch)
-        rho, J = found.residual, found.jacobian
-    else:
-        each = [
-            assess.predict(larger, np.r_[theta, own / scale], batch.take(np.array([r])))
-            for r, own in enumerate(x)
-        ]
-        rho = np.concatenate([f.residual for f in each])
-        J = np.concatenate([f.jacobian for f in each])
-    n = rho.size // batch.runs
-    J = J.reshape(batch.runs, n, -1)
+    found = assess.predict(larger, np.r_[theta, np.zeros(scale.size)], batch)
+    n = found.residual.size // batch.runs
+    J = found.jacobian.reshape(batch.runs, n, -1)
     T = J[..., p:] / scale
-    e = rho.reshape(-1, n)
-    if x is not None:
+    e = found.residual.reshape(-1, n)
+    if batch.at.deviations:
+        x = np.stack([d.size for d in batch.at.deviations], axis=1)
         e = e - np.einsum("rnq,rq->rn", T, x)
     return _Rows(batch, e, T, J[..., :p])
-
-
-def _moved(
-    structure: Structure, theta: FloatArray, rows: _Rows, scatter: Scatter, sizes: FloatArray
-) -> _Rows:
-    """The rows at each run's likeliest deviation, found in a few steps; as they are for free runs
-    (nearly linear) and where a step leads nowhere."""
-    batch = rows.batch
-    if batch.free:
-        return rows
-    best, x = rows, np.zeros((batch.runs, sizes.size))
-    for _ in range(STEPS):
-        x = np.clip(_likeliest(best, sizes), -0.5, 0.5)
-        trial = _rows(structure, theta, batch, scatter, x)
-        if not _finite([trial]):
-            return rows
-        best = trial
-    # the remainder goes into what was measured: residual = W (measured − predicted)
-    remainder = np.linalg.solve(batch.whitener, (best.residual - rows.residual)[..., None])[..., 0]
-    K = batch.compared
-    measured = batch.measured + remainder[:, :K] + 1j * remainder[:, K:]
-    return replace(best, batch=replace(batch, measured=measured))
 
 
 def _likeliest(rows: _Rows, sizes: FloatArray) -> FloatArray:
@@ -194,17 +232,28 @@ def _spread(rows: _Rows, sizes: FloatArray) -> FloatArray:
 
 
 def _widen(rows: _Rows, sizes: FloatArray) -> Batch:
-    b = rows.batch
+    """The batch whose residuals are e, with covariances widened by the spread."""
+    b, K = rows.batch, rows.batch.compared
     L = np.linalg.cholesky(_spread(rows, sizes))
     W = np.linalg.solve(L, b.whitener)
     inverse = np.linalg.inv(W)
     covariance = inverse @ inverse.transpose(0, 2, 1)
     added = np.diagonal(covariance - b.covariance, axis1=1, axis2=2)
-    added = added.reshape(b.runs, 2, b.compared).copy()
+    added = added.reshape(b.runs, 2, K).copy()
+    measured, at = b.measured, b.at
+    if at.deviations:  # e = W (measured − predicted) − T x: the last goes into what was measured
+        x = np.stack([d.size for d in at.deviations], axis=1)
+        taken = np.linalg.solve(b.whitener, np.einsum("rnq,rq->rn", rows.tangent, x)[..., None])
+        re, im = taken[:, :K, 0], taken[:, K:, 0].copy()
+        if b.free:  # turned so that the fundamental is real, which leaves a place for the frequency
+            measured = measured * np.exp(-1j * np.angle(measured[:, :1]) * np.arange(1, K + 1))
+            at = replace(at, omega=at.omega - 2 * np.pi * im[:, 0])
+            im[:, 0] = 0.0
+        measured = measured - (re + 1j * im)
     if b.free:
-        added[:, 1, 0] = 0.0  # the frequency's place
+        added[:, 1, 0] = 0.0
     noise = b.noise + np.maximum(added.sum(axis=1), 0.0)
-    return replace(b, whitener=W, covariance=covariance, noise=noise)
+    return replace(b, at=at, measured=measured, whitener=W, covariance=covariance, noise=noise)
 
 
 def _deviance(rows: Sequence[_Rows], sizes: FloatArray) -> float:
@@ -283,7 +332,12 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> st
                 return f"{name} follows the {word}: no chance"
     if not there.size:
         return ""
-    law = law_in(*_whitened(rows, sizes, there), known, laws)
+    residual, jacobian, deviations = _whitened(rows, sizes, there)
+    if scatter.location == "experiment":  # what wanders follows by chance what goes with the time
+        trends = np.stack([known["time"], known["time" + SQUARED]], axis=1)
+        slow = np.einsum("nmq,mk->nqk", deviations, trends).reshape(residual.size, -1)
+        jacobian = np.c_[jacobian, slow]
+    law = law_in(residual, jacobian, deviations, known, laws)
     if law is None:
         return ""
     which = " and ".join(names[j] for j in law.directions)

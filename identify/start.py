@@ -19,7 +19,6 @@ an answer. Low-discrepancy guesses of the poles stand by where it leads nowhere.
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,10 +26,9 @@ import numpy.typing as npt
 from identify import balance
 from identify.dataset import Batch, Dataset
 from identify.fit import (
-    Evaluated,
     Fit,
-    IntArray,
     OrbitResidual,
+    Pulled,
     Straightened,
     failed,
     fit_orbits,
@@ -46,7 +44,9 @@ FloatArray = npt.NDArray[np.float64]
 SHARES = (1e-3, 1e-2, 0.0)  # share of a coefficient's size that its weight counts as noise
 SCAN = 24  # assumed flame poles
 DENSE = 24  # starts that are polished where sparser ones led nowhere
+DISTANT = 40  # of those from the slow flow, of either sign, where the declared fit went astray
 NEARLY = 100.0  # χ²/dof beyond which the model is to blame, not a mode at the wrong place
+WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_weak_pulls`
 FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
 
@@ -469,11 +469,11 @@ def polish(
     """Starts led through coarse fits, side by side, with weak priors around them; best first."""
     if not starts:
         return []
-    centre = np.stack([s.theta for s in starts])
+    centre, pulls = np.stack([s.theta for s in starts]), _weak_pulls(structure)
     thetas, costs = centre, np.full(len(starts), np.inf)
     for share in shares:
         residual = OrbitResidual(structure, soften(data.fit, share), newton_steps=2)
-        straight = Straightened(WithPrior(residual, structure, centre), structure)
+        straight = Straightened(Pulled(residual, pulls, centre @ pulls.T), structure)
         descents = levenberg_marquardt(
             straight,
             straight.inside(thetas),
@@ -515,39 +515,29 @@ def dense_placements(count: int) -> list[tuple[float, ...]]:
     ]
 
 
-class WithPrior:
-    """A residual with weak pulls on the logarithms of poles and dampings.
+def _weak_pulls(structure: Structure) -> FloatArray:
+    """Rows (pulls, p) of weak pulls on the logarithms of poles and dampings.
 
     At coarse noise the misfit is flat along trades between a pole and a gain; the pull keeps
     frequencies within some 10 % of the guess, dampings and poles within a factor of three, one
     standard deviation each. The final fit has no prior.
     """
+    weights = np.zeros(len(structure.parameters))
+    for i, p in enumerate(structure.parameters.parameters):
+        for word, width in WIDTHS.items():
+            if p.kind == "positive" and word in p.name.split(".")[-1]:
+                weights[i] = 1.0 / width
+    return np.asarray(np.diag(weights)[weights > 0])
 
-    WIDTHS: ClassVar[dict[str, float]] = {
-        "frequency": 0.1,
-        "damping": 1.0,
-        "pole": 1.0,
-        "delay": 2.0,
-    }
 
-    def __init__(self, inner: OrbitResidual, structure: Structure, centres: FloatArray) -> None:
-        self.inner = inner
-        weights = np.zeros(centres.shape[1])
-        for i, p in enumerate(structure.parameters.parameters):
-            for word, width in self.WIDTHS.items():
-                if p.kind == "positive" and word in p.name.split(".")[-1]:
-                    weights[i] = 1.0 / width
-        self.rows = np.diag(weights)[weights > 0]
-        self.targets = centres @ self.rows.T
-
-    def __call__(self, thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated:
-        found = self.inner(thetas, which, jacobian)
-        pull = thetas @ self.rows.T - self.targets[which]
-        residual = np.concatenate([found.residual, pull], axis=1)
-        if found.jacobian is None:
-            return Evaluated(residual, None, found.exists)
-        more = np.broadcast_to(self.rows, (thetas.shape[0], *self.rows.shape))
-        return Evaluated(residual, np.concatenate([found.jacobian, more], axis=1), found.exists)
+def distant_starts(
+    structure: Structure, data: Dataset, effect_values: Sequence[float]
+) -> list[CoarseStart]:
+    """The polynomial balance's best starts, and those of the slow flow with the other modes placed
+    densely and of either sign: for data that lead the declared fit astray."""
+    exact = [] if structure.effects else coarse(structure, data, candidates(structure, data))[:6]
+    dense = dense_placements(structure.mode_count - 1)
+    return [*exact, *signed_starts(structure, data, [effect_values], dense)[:DISTANT]]
 
 
 def every_start(structure: Structure, data: Dataset) -> list[CoarseStart]:

@@ -47,6 +47,7 @@ class Conditions:
     Fourier coefficients, zero above the harmonics that were measured. `time` runs from 0 at the
     campaign's start to 1 at the start of its last run; `flame_on` is 0 for cold runs. Of a `free`
     run `omega` is only near its frequency; `spacing_m` is negative where microphones are exchanged.
+    By its `deviations` a run is known to differ from what the model says of all runs.
     """
 
     omega: FloatArray
@@ -58,6 +59,7 @@ class Conditions:
     identity: npt.NDArray[np.int64]
     free: npt.NDArray[np.bool_]
     spacing_m: FloatArray
+    deviations: tuple["Deviation", ...] = ()
     centre_m: float = 0.6858
     density_kg_m3: float = 1.2
     sound_speed_m_s: float = 343.0
@@ -72,7 +74,9 @@ class Conditions:
 
     def take(self, rows: npt.NDArray[np.int64]) -> "Conditions":
         """The same for some of the runs."""
-        return replace(self, **{n: getattr(self, n)[rows] for n in (*BY_RUN, *BY_HARMONIC)})
+        own = tuple(replace(d, size=d.size[rows]) for d in self.deviations)
+        arrays: dict[str, Any] = {n: getattr(self, n)[rows] for n in (*BY_RUN, *BY_HARMONIC)}
+        return replace(self, deviations=own, **arrays)
 
     def tile(self, times: int) -> "Conditions":
         """All runs repeated `times` times, for as many parameter vectors at once."""
@@ -85,13 +89,18 @@ class Conditions:
         return replace(self, **wide)
 
     def joined(self, other: "Conditions") -> "Conditions":
-        """These runs, then the other's, with as many harmonics as either has."""
+        """These runs, then the other's, with as many harmonics as either has, and deviations in
+        the same directions."""
         K = max(self.harmonics, other.harmonics)
         pair = self.padded(K), other.padded(K)
         joined: dict[str, Any] = {
             n: np.concatenate([getattr(c, n) for c in pair]) for n in (*BY_RUN, *BY_HARMONIC)
         }
-        return replace(self, **joined)
+        own = tuple(
+            replace(a, size=np.concatenate([a.size, b.size]))
+            for a, b in zip(self.deviations, other.deviations, strict=True)
+        )
+        return replace(self, deviations=own, **joined)
 
 
 @dataclass(frozen=True)
@@ -241,6 +250,19 @@ class Effect:
 
 
 @dataclass(frozen=True)
+class Deviation:
+    """How far each run deviates along an effect of one parameter: `size` (runs,)."""
+
+    effect: Effect
+    size: FloatArray
+
+    @property
+    def values(self) -> dict[str, FloatArray]:
+        """The effect's parameter by name, one row a run."""
+        return {self.effect.parameters[0].name: self.size[:, None]}
+
+
+@dataclass(frozen=True)
 class Known:
     """What starting values may lean on: sizes of the declared fit, never a simulator's truth."""
 
@@ -342,6 +364,8 @@ class Structure:
             drive = e.drive(p, at, drive)
         for e in self.effects:
             drive = e.actuator(p, at, s) * drive
+        for d in at.deviations:
+            drive = d.effect.actuator(d.values, at, s) * drive
         on = at.flame_on[:, None]
         by_flame = [m.flame_residue for m in modes]
         by_drive = [m.speaker_residue for m in modes]
@@ -398,6 +422,8 @@ class Structure:
         modes = declared_modes(p, self.mode_count)
         for e in self.effects:
             modes = e.modes(p, at, modes)
+        for d in at.deviations:
+            modes = d.effect.modes(d.values, at, modes)
         return modes
 
     def _branch(self, p: Values, modes: list[Mode], s: Any) -> Branch | None:

@@ -2,6 +2,7 @@
 
 A `Scatter` names the directions in which each run may deviate, effects of one parameter each that
 is zero on average; its own parameters are the standard deviations. `identify.scatter` fits it.
+Deviations along a direction add up: twice 0.1 is 0.2, so that a ratio is named by its logarithm.
 """
 
 from collections.abc import Sequence
@@ -13,11 +14,28 @@ from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Mode, Values
 
 
+class Direction(Effect):
+    """An effect of one parameter, through its hooks `modes` and `actuator` alone."""
+
+    common = True  # whether the declared model absorbs what all runs deviate by together
+
+    @property
+    def scale(self) -> float:
+        return self.parameters[0].scale
+
+    @property
+    def unit(self) -> str:
+        return self.parameters[0].unit
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+
 class Scatter(Effect):
     """Standard deviations of what changes from run to run, and the directions it takes."""
 
     def __init__(
-        self, name: str, location: str, form: str, sizes: Sequence[tuple[str, str, Effect]]
+        self, name: str, location: str, form: str, sizes: Sequence[tuple[str, str, Direction]]
     ) -> None:
         self.name, self.location, self.form = name, location, form
         self.parameters = tuple(
@@ -26,30 +44,25 @@ class Scatter(Effect):
         self.directions = tuple(direction for _, _, direction in sizes)
 
 
-class Change(Effect):
-    """A constant relative change of frequency, flame or speaker gain."""
+class Change(Direction):
+    """A change of frequency, flame or speaker gain, as the logarithm of its ratio."""
 
     location = "experiment"
 
     def __init__(self, what: str, scale: float) -> None:
         self.what, self.name = what, f"change_{what}"
-        self.parameters = (Parameter(f"{self.name}.relative", "1", scale=scale),)
-
-    def neutral(self) -> tuple[float, ...]:
-        return (0.0,)
+        self.parameters = (Parameter(f"{self.name}.log_ratio", "1", scale=scale),)
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
-        return changed(modes, self.what, p[self.parameters[0].name] + 1.0)
+        return changed(modes, self.what, dual.exp(p[self.parameters[0].name]))
 
 
-class DrivePhase(Effect):
-    """The sound lags the recorded drive by a constant phase."""
+class DrivePhase(Direction):
+    """The sound lags the recorded drive by a phase."""
 
     name, location = "drive_phase", "actuator"
     parameters = (Parameter("drive_phase.shift", "rad", scale=1e-2),)
-
-    def neutral(self) -> tuple[float, ...]:
-        return (0.0,)
+    common = False
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
         return dual.exp(p["drive_phase.shift"] * -1j)
