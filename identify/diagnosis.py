@@ -270,7 +270,7 @@ def _judge(
         best = trace.best_form(good)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
         others = trace.rivals(best, trace.best_by_name([*good, *spreads]))
-        words = " + ".join(best.names)
+        words = best.words
         if not others:
             open_ = trace.other_forms(best, good)
             forms = [
@@ -280,19 +280,19 @@ def _judge(
             ]
             said = f"Adding {words} explains the data; no rival does."
             return "traced", best, said + "".join(forms)
-        names = ", ".join(" + ".join(t.names) for t in others)
+        names = ", ".join(t.words for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."
     ranked = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)
     near = _nearly(ranked, base.chi2, data)
     if near is not None:
-        words = " + ".join(near.names)
+        words = near.words
         return "traced", near, (
             f"Adding {words} takes away all but a trace of the misfit and predicts the validation "
             f"runs as well as noise permits; χ²/dof {near.fit.chi2_per_dof:.2g} is left."
         )  # fmt: skip
     chosen = _foremost(ranked)
     left = "" if chosen is None else (
-        f" The best, {' + '.join(chosen.names)}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
+        f" The best, {chosen.words}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
         "it is reported, not claimed."
     )  # fmt: skip
     near_it = [t for t in tried if t.explains]
@@ -346,7 +346,7 @@ def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tupl
     out = []
     for t in ordered[:SHOWN]:
         alike = [o for o in good if t.explains and o is not t and _alike(t, o, chosen)]
-        equal = [" + ".join(o.names) for o in alike]
+        equal = [o.words for o in alike]
         out.append(trace.candidate(t, base, equal))
     return tuple(out)
 
@@ -399,5 +399,5 @@ def _next(
     best = trace.best_by_name(tried)
     others = trace.rivals(chosen, best) if verdict == "ambiguous" else best
     group = [chosen, *(t for t in others if t.plausible and t.key != chosen.key)]
-    rivals = [design.Rival(" + ".join(t.names), t.fit) for t in group]
+    rivals = [design.Rival(t.words, t.fit) for t in group]
     return design.next_experiment(rivals, ready, verdict)

@@ -17,9 +17,10 @@ from identify.executor import InProcess
 from identify.fit import Fit, fit_orbits
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
+from identify.parameters import Estimate
 from identify.report.gallery import save_figures
 from identify.results import PLACES
-from identify.scatter import fit_scatter
+from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
 from identify.trace.contests import in_other_forms
 from identify.trace.places import shaped, whereabouts
@@ -577,6 +578,48 @@ def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> No
     change = best.estimates["parameter_drift.relative_change"]
     over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
     assert abs(change.value - 0.0015 * over) < 4 * change.stderr
+
+
+def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
+    """The speaker warms while all frequencies wander: two kinds of drift."""
+    both = [
+        ("parameter_drift", {"speaker_gain_change": 0.02}),
+        ("parameter_drift", {"frequency_walk": 0.002}),
+    ]
+    ready = thesis_campaign(tmp_path, 7, both, noise_db=50.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    forms = ("speaker_gain", "flame_gain", "damping")
+    laws = [*(f"parameter_drift:{form}" for form in forms), "flame_delay"]
+    catalogue = [*(by_key(k) for k in laws), *SCATTERS]
+    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
+    good = [t for t in found if t.explains and trace.accounts(t, base, found)]
+    best = trace.best_form(good)
+    assert best.words == "parameter_drift:speaker_gain + parameter_drift:random"
+    assert best.names == ("parameter_drift", "parameter_drift")
+    assert trace.rivals(best, trace.best_by_name(found)) == []
+    assert trace.other_forms(best, good) == {"parameter_drift": ()}
+    change = best.estimates["parameter_drift.relative_change"]
+    over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
+    assert abs(change.value - 0.02 * over) < 4 * change.stderr
+
+
+@pytest.mark.parametrize(("gain", "claimed"), [(5.0, False), (15.0, True)])
+def test_a_law_beside_a_spread_must_gain_on_the_spread_alone(gain: float, claimed: bool) -> None:
+    law, far = tried_as(fitted(2, 40.0), "flame_delay"), fitted(0, 80.0)
+    sizes = {"flame_gain_modulation.modulation_rms": Estimate(0.01, 0.002, "1")}
+    alone = trace.Tried(
+        (FLAME,),
+        fitted(0, 1.0),
+        1e-3,
+        0.5,
+        0.5,
+        Spread(fitted(0, 1.0), None, sizes, 100.0, "?"),  # type: ignore[arg-type]
+    )
+    beside = fitted(2, 1.0)
+    penalty = alone.evidence - gain - (beside.chi2 + 3 * float(np.log(beside.residual.size)))
+    spread = Spread(beside, None, sizes, penalty, "")  # type: ignore[arg-type]
+    both = trace.Tried((*law.effects, FLAME), beside, 1e-3, 0.5, 0.5, spread)
+    assert trace.accounts(both, far, [law, alone, both]) is claimed
 
 
 @pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])

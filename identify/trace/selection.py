@@ -198,8 +198,9 @@ class _Searching:
         for parent in parents:
             if good and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
-            other = [s for s in self.scatters if s.name not in parent.names]
-            found = try_scatters(parent.fit.structure, self.data, parent.fit, other, self.run)
+            found = try_scatters(
+                parent.fit.structure, self.data, parent.fit, self.scatters, self.run
+            )
             self.tried += [*found, *_without_chance(found, self.data)]
         if not self.explained:
             alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
@@ -267,9 +268,10 @@ def _beside_chance(
         assert isinstance(chance, Scatter)
         assert t.spread is not None
         base, wide = t.fit, t.spread.data
-        others = [a for a in available if a.name != chance.name]
-        scores = score_tests(base.structure, wide, base, others, run)
-        ranked = sorted((e for e in others if e.key in scores), key=lambda e: -scores[e.key].drop)
+        scores = score_tests(base.structure, wide, base, available, run)
+        ranked = sorted(
+            (e for e in available if e.key in scores), key=lambda e: -scores[e.key].drop
+        )
         first: dict[str, Effect] = {}  # the best form of each
         for e in ranked:
             first.setdefault(e.name, e)
@@ -302,7 +304,7 @@ def _beside_the_same_chance(
     base = with_fewer(best, (), wide)
     if not np.isfinite(base.chi2):
         return []
-    others = [a for a in available if a.name not in (law.name, chance.name)]
+    others = [a for a in available if a.name != law.name]
     found = try_effects(
         base.structure, wide, base, others, executor=run, keep=5, far=False,
         progress=lambda share, text: report(0.95 + 0.05 * share, text),

@@ -13,6 +13,7 @@ from identify import assess
 from identify.chances import chi2_tail
 from identify.dataset import Dataset
 from identify.effects import CATALOGUE
+from identify.effects.scatter import Scatter
 from identify.fit import Fit
 from identify.parameters import Estimate
 from identify.results import Candidate
@@ -45,6 +46,17 @@ class Tried:
     @property
     def key(self) -> tuple[str, ...]:
         return tuple(sorted(self.names))
+
+    @property
+    def parts(self) -> frozenset[str]:
+        """What it consists of, whatever the forms: a law and chance may go by the same name."""
+        return frozenset(e.key if isinstance(e, Scatter) else e.name for e in self.effects)
+
+    @property
+    def words(self) -> str:
+        """The effects' names; their forms too where two go by the same."""
+        twice = len(set(self.names)) < len(self.names)
+        return " + ".join(e.key if twice else e.name for e in self.effects)
 
     @property
     def key_of_forms(self) -> tuple[str, ...]:
@@ -144,10 +156,10 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         if t.key != best.key
         and (t.explains or _chance_rivals(t, best))
         and t.evidence < best.evidence + EVIDENCE
-        and not set(best.names) < set(t.names)
+        and not best.parts < t.parts
         and not _extends(t, best)
     ]
-    return [t for t in found if not any(set(o.names) < set(t.names) for o in found)]
+    return [t for t in found if not any(o.parts < t.parts for o in found)]
 
 
 def _chance_rivals(spread: Tried, best: Tried) -> bool:
@@ -168,14 +180,16 @@ def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ..
         if t.evidence < best.evidence + EVIDENCE:
             for e in t.effects:
                 out[e.name].append(e.form)
-    own = {e.name: e.form for e in best.effects}
-    return {n: tuple(f for f in dict.fromkeys(forms) if f != own[n]) for n, forms in out.items()}
+    own = {(e.name, e.form) for e in best.effects}
+    return {
+        n: tuple(f for f in dict.fromkeys(forms) if (n, f) not in own) for n, forms in out.items()
+    }
 
 
 def _extends(t: Tried, best: Tried) -> bool:
     """Whether `t` is `best` with an extension that the data do not ask for."""
     general = {n for e in t.effects for n in e.generalises}
-    return t.fit.theta.size > best.fit.theta.size and set(best.names) <= set(t.names) | general
+    return t.fit.theta.size > best.fit.theta.size and best.parts <= t.parts | general
 
 
 def gain_p(t: Tried, without: Fit) -> float:
@@ -188,12 +202,15 @@ def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
     """Whether the misfit that is left without one of the effects goes with it: more than chance
     takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
     worse. What takes a part of little may leave the cause behind, under the threshold. A spread
-    does so by widening the noise: its likelihood is penalised for that, and must still gain."""
-    fewer = [o for o in tries if o.spread is None and set(o.names) < set(t.names)]
+    does so by widening the noise: its likelihood is penalised for that, and must still gain, on
+    the law beside it and, so that one is claimed, on the spread alone."""
+    fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
     without = min([declared, *(o.fit for o in fewer)], key=lambda fit: fit.chi2)
     excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (without, t.fit))
     if t.spread is not None:
-        return left < excess / 3 and t.evidence < _evidence(without) - EVIDENCE
+        alone = [o.evidence for o in tries if o.spread and o.parts < t.parts]
+        least = min([_evidence(without), *alone])
+        return left < excess / 3 and t.evidence < least - EVIDENCE
     worse = any(o.validation_error < t.validation_error for o in fewer)
     return gain_p(t, without) < ALPHA and left < excess / 3 and not worse
 

@@ -1,0 +1,104 @@
+"""Runs that deviate a lot, each by its own: what they deviate by, found with the parameters."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identify import assess, start
+from identify.effects.scatter import SCATTERS, DrivePhase, Scatter
+from identify.own import Own, settle
+from identify.scatter import fit_scatter
+from simulated_rig.config import Drift
+from simulated_rig.drift import change_at
+from tests.trace_material import thesis_campaign
+
+SEED = 5
+WALK = 0.004
+
+
+def named(name: str) -> Scatter:
+    return next(s for s in SCATTERS if s.name == name)
+
+
+def test_placed_deviations_and_unknown_ones_are_the_same(tmp_path: Path) -> None:
+    ready = thesis_campaign(tmp_path, SEED, {})
+    fit = start.fit_from_data(ready.structure, ready.data)
+    batch = ready.data.fit[0]
+    drive = named("drive_scatter")
+    own = Own(drive.directions, batch.at.identity)
+    z = np.random.default_rng(1).normal(size=len(own.parameters))
+    unknown = assess.predict(
+        ready.structure.with_effects(own), np.concatenate([fit.theta, z]), batch
+    )
+    placed = own.placed(batch, z)
+    known = assess.predict(ready.structure, fit.theta, placed)
+    np.testing.assert_allclose(known.orbits.velocity, unknown.orbits.velocity, rtol=1e-9)
+    away = np.abs(known.residual - assess.predict(ready.structure, fit.theta, batch).residual)
+    assert away.max() > 1.0
+    gain, phase = placed.at.deviations
+    assert abs(gain.size.sum()) < 1e-12  # the speaker's gain is the declared model's own
+    assert isinstance(phase.effect, DrivePhase)
+    assert abs(phase.size.sum()) > 1e-3
+
+
+def test_runs_that_no_drive_reaches_are_left_alone(tmp_path: Path) -> None:
+    ready = thesis_campaign(tmp_path, SEED, {})
+    fit = start.fit_from_data(ready.structure, ready.data)
+    nobody = Own(named("drive_scatter").directions, np.empty(0, dtype=np.int64), absorbed=False)
+    assert settle(ready.structure, nobody, fit.theta, ready.data.fit[1], np.ones(2)) is None
+
+
+def test_a_gross_walk_of_the_frequency_leads_nothing_astray(tmp_path: Path) -> None:
+    """The declared fit ends nowhere near the rig; each run's own frequency is found all the same,
+    but for what is common to all."""
+    effects = {"parameter_drift": {"frequency_walk": WALK}}
+    ready = thesis_campaign(tmp_path, SEED, effects, noise_db=70.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert base.chi2_per_dof > 1e4
+    spread = fit_scatter(ready.structure, ready.data, base, named("parameter_drift"))
+    assert spread is not None
+    assert spread.objection == ""
+    assert spread.fit.converged
+    assert assess.lack_of_fit_p(spread.fit.chi2, spread.fit.dof) > 1e-3
+    walk = Drift("frequency", WALK, kind="walk")
+    found, truth = [], []
+    for batch in spread.data.fit:
+        found += list(batch.at.deviations[0].size)
+        truth += [np.log1p(change_at(walk, float(t), SEED)) for t in batch.started_s]
+    assert np.ptp(truth) > 1e-3
+    np.testing.assert_allclose(found - np.mean(found), truth - np.mean(truth), atol=1e-4)
+    # what single runs deviate by is left out: the parameters are the rig's own
+    values, errors = spread.fit.values, spread.fit.estimates
+    assert abs(values["mode1.damping"] - 0.0105) < 4 * errors["mode1.damping"].stderr
+
+
+def test_a_drive_that_scatters_by_five_per_cent(tmp_path: Path) -> None:
+    size = {"gain_rms": 0.05, "phase_rms_rad": 0.05}
+    ready = thesis_campaign(tmp_path, SEED, {"drive_scatter": size}, noise_db=70.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert base.chi2_per_dof > 1e4
+    spread = fit_scatter(ready.structure, ready.data, base, named("drive_scatter"))
+    assert spread is not None
+    assert assess.lack_of_fit_p(spread.fit.chi2, spread.fit.dof) > 1e-3
+    gain = spread.sizes["drive_scatter.gain_rms"]
+    assert abs(np.log(gain.value / 0.05)) < 3 * gain.stderr / gain.value
+
+
+@pytest.mark.parametrize("name", ["drive_scatter", "parameter_drift"])
+def test_the_widened_data_are_where_the_fit_ended(tmp_path: Path, name: str) -> None:
+    """Fitted again to them, the model stays where it is, free runs included."""
+    ready = thesis_campaign(tmp_path, SEED, {"parameter_drift": {"frequency_walk": WALK}})
+    base = start.fit_from_data(ready.structure, ready.data)
+    spread = fit_scatter(ready.structure, ready.data, base, named(name))
+    assert spread is not None
+    again = [assess.predict(ready.structure, spread.fit.theta, b) for b in spread.data.fit]
+    residual = np.concatenate([p.residual for p in again])
+    np.testing.assert_allclose(residual, spread.fit.residual, atol=1e-6 * np.abs(residual).max())
+    jacobian = np.concatenate([p.jacobian for p in again])
+    gradient = jacobian.T @ residual
+    size = np.sqrt(np.sum(jacobian**2, axis=0) * float(residual @ residual))
+    assert np.all(np.abs(gradient) < 1e-2 * size)
+    one = replace(ready.data, validation=())
+    assert fit_scatter(ready.structure, one, base, named(name)) is not None
