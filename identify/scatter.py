@@ -43,6 +43,8 @@ TREND_P = 0.003  # a rank correlation less probable than this is a law, not chan
 ONE_RUN = 0.9  # share of all deviation that a single run may hold
 SMALLEST = 1e-8
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
+HOPELESS = 5.0  # χ² a residual beyond which further rounds, or less noise, mend nothing …
+FAR = 30.0  # … and at first, when σ is no more than a guess
 LEADING = 10.0  # typical sizes of each direction that the lead-in allows
 ASTRAY = 300.0  # χ²/dof beyond which the base fit is no place to start from alone
 #: How they are led in: harmonics, share of noise, Newton steps, and how many are kept.
@@ -85,7 +87,7 @@ def fit_scatter(structure: Structure, data: Dataset, base: Fit, scatter: Scatter
     if forced < LEAST_RUNS or not np.isfinite(base.chi2):
         return None
     own = Own(scatter.directions, _reached(data.fit, scatter))
-    starts = [_near(structure, base, own)]
+    starts = [np.concatenate([base.theta, np.zeros(len(own.parameters))])[None]]
     if base.chi2_per_dof > ASTRAY:
         starts.append(_afar(structure, data, own, base))
     found = []
@@ -110,12 +112,9 @@ def _guess(own: Own) -> FloatArray:
     return np.array([LEADING * d.scale for d in own.directions])
 
 
-def _near(structure: Structure, base: Fit, own: Own) -> FloatArray:
-    return np.concatenate([base.theta, np.zeros(len(own.parameters))])[None]
-
-
 def _afar(structure: Structure, data: Dataset, own: Own, base: Fit) -> FloatArray:
-    """Starts from the slow flow wherever the base fit is, led through falling noise."""
+    """Starts from the slow flow wherever the base fit is, led through falling noise; none where
+    that leads nowhere."""
     rough = data.coarse()
     inherited = [base.values[q.name] for e in structure.effects for q in e.parameters]
     begun = distant_starts(structure, rough, inherited)
@@ -126,8 +125,8 @@ def _afar(structure: Structure, data: Dataset, own: Own, base: Fit) -> FloatArra
         led = lead(
             structure, own, batches, thetas, _guess(own), share=share, steps=steps, iterations=20
         )
-        if not led:
-            break
+        if not led or led[0].cost > sum(2 * b.compared * b.runs for b in batches):
+            return thetas[:0]  # more is left than even noise so raised explains
         thetas = np.stack([np.r_[x.theta, x.own] for x in led[:kept]])
     return thetas
 
@@ -136,9 +135,9 @@ def _alternate(
     structure: Structure, data: Dataset, own: Own, starts: FloatArray, scatter: Scatter
 ) -> Spread | None:
     sizes, settled = _guess(own), False
-    for _ in range(ROUNDS):
-        found = lead(structure, own, data.fit, starts, sizes)
-        if not found:
+    for i in range(ROUNDS):
+        found = lead(structure, own, data.fit, starts, sizes) if len(starts) else []
+        if not found or found[0].cost > (FAR if i == 0 else HOPELESS) * data.residuals:
             return None
         led = found[0]
         rows = [_rows(structure, led.theta, own.placed(b, led.own), scatter) for b in data.fit]
