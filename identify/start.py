@@ -47,6 +47,7 @@ DENSE = 24  # starts that are polished where sparser ones led nowhere
 DISTANT = 40  # of those from the slow flow, of either sign, where the declared fit went astray
 NEARLY = 100.0  # χ²/dof beyond which the model is to blame, not a mode at the wrong place
 WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_weak_pulls`
+LONG = 600  # iterations that lead on what comes nearest and has not converged
 FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
 
@@ -388,20 +389,34 @@ def signed_starts(
 
     A residue does not come through zero on its way down a misfit that it is not alone to blame for.
     """
-    index, n = structure.parameters.index, structure.mode_count
-    residues = [index[f"mode{i}.flame_residue"] for i in range(2, n + 1)]
-    others = [index[f"mode{i}.frequency_hz"] for i in range(2, n + 1)]
-    own = [index[q.name] for e in structure.effects for q in e.parameters]
     thetas = []
     for row in effect_values:
-        for theta in _slow_flow_thetas(structure, data, row, placements):
-            for signs in product((1.0, -1.0), repeat=n - 1):
-                signed = theta.copy()
-                signed[residues] *= 4 * np.array(signs)
-                thetas.append(signed)
+        thetas += _signed(structure, _slow_flow_thetas(structure, data, row, placements))
+    return _best_of_each(structure, coarse(structure, data, thetas))
+
+
+def _signed(structure: Structure, thetas: Sequence[FloatArray]) -> list[FloatArray]:
+    """Each with four times the flame residues of the modes that do not sing, of either sign."""
+    index, n = structure.parameters.index, structure.mode_count
+    residues = [index[f"mode{i}.flame_residue"] for i in range(2, n + 1)]
+    out = []
+    for theta in thetas:
+        for signs in product((1.0, -1.0), repeat=n - 1):
+            signed = theta.copy()
+            signed[residues] *= 4 * np.array(signs)
+            out.append(signed)
+    return out
+
+
+def _best_of_each(structure: Structure, starts: Sequence[CoarseStart]) -> list[CoarseStart]:
+    """Of sorted starts the first for each row of effect values, placement and signs."""
+    index, others = structure.parameters.index, range(2, structure.mode_count + 1)
+    residues = [index[f"mode{i}.flame_residue"] for i in others]
+    own = [index[q.name] for e in structure.effects for q in e.parameters]
+    where = [*(index[f"mode{i}.frequency_hz"] for i in others), *own]
     best: dict[bytes, CoarseStart] = {}
-    for found in coarse(structure, data, thetas):
-        kind = np.r_[found.theta[[*others, *own]], np.sign(found.theta[residues])]
+    for found in starts:
+        kind = np.r_[np.round(found.theta[where], 6), np.sign(found.theta[residues])]
         best.setdefault(kind.tobytes(), found)
     return list(best.values())
 
@@ -571,8 +586,11 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
     hopeless = fit.chi2_per_dof > NEARLY and fit.dof >= FEW * fit.theta.size
     if structure.mode_count < 2 or _adequate(fit) or hopeless:
         return fit
-    again = _replaced(structure, data, rough, fit)
-    return min((fit, *again), key=lambda f: (not f.converged, f.chi2))
+    found = [fit, *_replaced(structure, data, rough, fit)]
+    best = min(found, key=lambda f: f.chi2)
+    if not best.converged:  # in a long valley, with few runs
+        found.append(fit_orbits(structure, data, best.theta, continuation=(0.0,), iterations=LONG))
+    return min(found, key=lambda f: (not f.converged, f.chi2))
 
 
 def _moved(
@@ -604,15 +622,11 @@ def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) ->
     such a fit says of the singing mode, flame and nonlinearity is good all the same.
     """
     dense = dense_placements(structure.mode_count - 1)
-    thetas = _slow_flow_thetas(structure, rough, (), dense)
+    thetas = _signed(structure, _slow_flow_thetas(structure, rough, (), dense))
     for placement in dense:
         thetas += _moved(structure, near, data.free_hz, placement)
-    others = [structure.parameters.index[f"mode{i}.frequency_hz"]
-              for i in range(2, structure.mode_count + 1)]  # fmt: skip
-    best: dict[tuple[float, ...], CoarseStart] = {}
-    for found in coarse(structure, rough, thetas):  # best first: one of each placement
-        best.setdefault(tuple(np.round(found.theta[others], 6)), found)
-    polished = polish(structure, rough, list(best.values())[:DENSE])
+    starts = _best_of_each(structure, coarse(structure, rough, thetas))
+    polished = polish(structure, rough, starts[:DENSE])
     if not polished:
         return []
     distinct: list[FloatArray] = []
