@@ -41,8 +41,9 @@ NEARBY = 0.7  # of the logarithm, where another form is matched
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
 LED_ON = 4  # of the best of a level that had not converged …
 FARTHEST = 300  # … by so many iterations more
-REFORMED = 3  # sets of effects of which other forms are tried …
-NEAR = 30.0  # … where they leave no more than so much χ²/dof
+REFORMED = 3  # sets of effects of which other forms are tried: the best one, and others …
+NEAR = 30.0  # … that leave no more than so much χ²/dof …
+BEHIND = 3.0  # … and, where forms of a better one explain the data, than so many times its χ²
 
 
 def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
@@ -100,36 +101,32 @@ def in_other_forms(
     if best is None:
         return []
     done = {t.key_of_forms for t in tries if t.adequate}
-    return _each_in_other_forms([best], data, available, run, done)[0]
+    return _in_each_form(best, data, available, run, done)
 
 
-def _each_in_other_forms(
-    sets: Sequence[Tried],
+def _in_each_form(
+    t: Tried,
     data: Dataset,
     available: Sequence[Effect],
     run: Executor,
     done: Collection[tuple[str, ...]] = (),
-) -> list[list[Tried]]:
-    """For each of `sets` its effects in their other forms, but for what (by forms) is `done`."""
+) -> list[Tried]:
+    """Each effect of `t` in its other forms, but for what (by forms) is `done`."""
     items = []
-    for t in sets:
-        for e in t.effects:
-            kept = tuple(o for o in t.effects if o is not e)
-            items += [
-                (t, kept, e, form, data)
-                for form in available
-                if form.name == e.name
-                and form.key != e.key
-                and not (form.refines and t.explains)
-                and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
-                and key_of_forms((*kept, form)) not in done
-            ]
+    for e in t.effects:
+        kept = tuple(o for o in t.effects if o is not e)
+        items += [
+            (t, kept, e, form, data)
+            for form in available
+            if form.name == e.name
+            and form.key != e.key
+            and not (form.refines and t.explains)
+            and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
+            and key_of_forms((*kept, form)) not in done
+        ]
     items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
-    out: dict[int, list[Tried]] = {id(t): [] for t in sets}
-    for (t, *_), fit in zip(items, run.map(_in_form, items), strict=True):
-        if fit is not None and np.isfinite(fit.chi2):
-            out[id(t)].append(tried(fit.structure.effects, fit, data))
-    return list(out.values())
+    fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
+    return [tried(fit.structure.effects, fit, data) for fit in fits]
 
 
 def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) -> Fit | None:
@@ -214,18 +211,38 @@ def reformed(
     Those in `done` (keys of forms) have had theirs; what is seen to here joins them.
     """
     out: list[Tried] = []
-    ahead = [t for t in best_by_name(grown) if t.fit.chi2_per_dof < NEAR][:REFORMED]
-    turns = max((len(t.effects) for t in ahead), default=0)
-    for _ in range(turns):
-        current = [t for t in ahead if t.key_of_forms not in done]
-        ahead = []
-        found = [*zip(current, _each_in_other_forms(current, data, available, run), strict=True)]
-        done |= {t.key_of_forms for t in current}
-        for t, others in found:
-            out += others
-            best = min(others, key=misfit, default=t)
-            if not best.explains and best.fit.chi2 < t.fit.chi2 - EVIDENCE:
-                ahead.append(best)
+    least = np.inf  # misfit of the best set of which a form explains the data
+    for i, first in enumerate(best_by_name(grown)[:REFORMED]):
+        near = first.fit.chi2_per_dof < (GROSS if i == 0 else NEAR)
+        if not near or first.fit.chi2 > BEHIND * least:
+            continue
+        found = _in_all_forms(first, data, available, run, done)
+        out += found
+        if any(t.explains for t in found):
+            least = min(least, first.fit.chi2)
+    return out
+
+
+def _in_all_forms(
+    first: Tried,
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    done: set[tuple[str, ...]],
+) -> list[Tried]:
+    """A set of effects in their other forms, one effect after the other while that brings gain."""
+    out: list[Tried] = []
+    current = first
+    for _ in first.effects:
+        if current.key_of_forms in done:
+            break
+        found = _in_each_form(current, data, available, run)
+        done.add(current.key_of_forms)
+        out += found
+        best = min(found, key=misfit, default=current)
+        if best.explains or best.fit.chi2 >= current.fit.chi2 - EVIDENCE:
+            break
+        current = best
     return out
 
 

@@ -26,7 +26,16 @@ from identify.trace.contests import (
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
-from identify.trace.tried import BEATEN, GROSS, Tried, best_by_name, best_form, misfit, tried
+from identify.trace.tried import (
+    BEATEN,
+    EVIDENCE,
+    GROSS,
+    Tried,
+    best_by_name,
+    best_form,
+    misfit,
+    tried,
+)
 
 Progress = Callable[[float, str], None]
 
@@ -142,7 +151,7 @@ class _Searching:
         self.tried += singles
         if base.chi2_per_dof < LITTLE or not self.explained:
             self.report(0.6, "trying run-to-run scatter")
-            self.tried += try_scatters(self.structure, data, base, self.scatters, run)
+            self.tried += self._scattered(self.structure, base)
         return singles
 
     def pairs(self, singles: Sequence[Tried]) -> list[Tried]:
@@ -198,14 +207,19 @@ class _Searching:
         for parent in parents:
             if good and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
-            found = try_scatters(
-                parent.fit.structure, self.data, parent.fit, self.scatters, self.run
-            )
+            found = self._scattered(parent.fit.structure, parent.fit)
             self.tried += [*found, *_without_chance(found, self.data)]
         if not self.explained:
             alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
             found = _beside_chance(alone, self.data, self.apart, self.run)
             self.tried += [*found, *_without_chance(found, self.data)]
+
+    def _scattered(self, structure: Structure, base: Fit) -> list[Tried]:
+        """Run-to-run scatter on top of `structure`; beside what explains the data already, as far
+        as it is a rival."""
+        good = [t.evidence for t in self.tried if t.explains]
+        most = min(good, default=np.inf) + EVIDENCE
+        return try_scatters(structure, self.data, base, self.scatters, self.run, most)
 
     def contest(self) -> None:
         """What might do as well as the best is tried before it is claimed."""
@@ -317,10 +331,17 @@ def _beside_the_same_chance(
 
 
 def try_scatters(
-    structure: Structure, data: Dataset, base: Fit, scatters: Sequence[Scatter], run: Executor
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    scatters: Sequence[Scatter],
+    run: Executor,
+    most: float = np.inf,
 ) -> list[Tried]:
-    """Each kind of random difference from run to run on top of `structure`."""
-    spreads = run.map(_scattered, [(structure, data, base, s) for s in scatters])
+    """Each kind of random difference from run to run on top of `structure`, but for those whose
+    evidence (χ² + p ln n) is surely beyond `most`."""
+    least = most - base.theta.size * float(np.log(data.residuals))
+    spreads = run.map(_scattered, [(structure, data, base, s, least) for s in scatters])
     return [
         replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
         for s, spread in zip(scatters, spreads, strict=True)
@@ -328,7 +349,7 @@ def try_scatters(
     ]
 
 
-def _scattered(item: tuple[Structure, Dataset, Fit, Scatter]) -> Spread | None:
+def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float]) -> Spread | None:
     return fit_scatter(*item)
 
 
