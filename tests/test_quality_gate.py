@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from identify.quality import Quality, inspect
-from identify.record import Campaign, Signal
+from identify.record import Campaign, Medium, Signal
 from tests.quality_material import (
     FREE_HZ,
     FREE_PA,
@@ -288,6 +288,24 @@ def test_a_tone_on_a_harmonic_counts_there_as_noise(
     assert spoilt[run].severity == "down_weighted"
     assert spoilt[run].to_json()["harmonics"] == [order]
     assert not found.doubted  # the run's other harmonics are as good as ever
+
+
+def test_a_multiple_of_the_mains_is_believed_where_one_run_shows_it() -> None:
+    """Forced at and around 180 Hz: of its third multiple only the free run shows anything."""
+    rng = np.random.default_rng(8)
+    runs = [run_of("free", None, 0.0, rng)]
+    runs += [run_of(f"{f:g}Hz", f, 3.0, rng) for f in (178.0, 179.0, 180.0, 181.0, 182.0)]
+    quiet = Campaign("around 180 Hz", tuple(runs), Medium())
+    third = edited(quiet, line(180.0, 1.0))
+    assert inspect(third).tones == ()  # by itself it might be anything
+    found = inspect(edited(third, line(60.0, 2.0)))
+    assert [t.frequency_hz for t in found.tones] == [
+        pytest.approx(60.0, abs=0.1),
+        pytest.approx(180.0, abs=0.1),
+    ]
+    assert found.tones[1].runs == ("free",)
+    spoilt = [(f.run, f.harmonics) for f in found.flags if f.flag == "tone_on_harmonic"]
+    assert ("180Hz", (1,)) in spoilt
 
 
 def test_a_tone_in_one_run_is_no_interference(clean: Campaign) -> None:

@@ -3,6 +3,10 @@
 A line is interference when it stands at the same frequency, to within a bin, in more than half of
 the runs where it could be seen. A rig's own narrow resonance, shaken by turbulence, peaks
 elsewhere in every run: where such scattered peaks surround it, a line is not believed.
+
+A line of the mains brings its multiples. One of those is believed wherever the rig's own lines
+leave it to be seen, be it in a single run: forced at three times 50 Hz, no run shows what it takes
+for its own.
 """
 
 from collections.abc import Sequence
@@ -32,6 +36,7 @@ ORDERS = 200  # harmonics of a discontinuous loop that may fold into the band
 LEAST_ALONE = 5e-4  # of the fundamental: a smaller line in one run harms nothing
 SEEN_SHARE = 0.4  # of the runs in which a tone must not be hidden by the rig's own lines
 MAINS_HZ = (50.0, 60.0)
+MAINS_ORDERS = 20
 
 
 @dataclass(frozen=True)
@@ -96,7 +101,26 @@ def tones(
             if lone and abs(p.frequency_hz - own) > OWN * own and not derived(p, found, where.view):
                 sighting = Sighting(where, p.bin, p.ratio)
                 flags.append(line_flag(sighting, p.frequency_hz, False))
+    for frequency in multiples(out):
+        if not any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out):
+            present = sightings(searched, frequency, of_mains=True)
+            tone = common(searched, frequency, present) if present else None
+            if tone is not None:
+                out.append(tone)
+                flags += [line_flag(s, frequency, True) for s in present]
     return tuple(out), flags
+
+
+def multiples(found: Sequence[Tone]) -> list[float]:
+    """Multiples of the mains' frequency, where a line of it has been found, in Hz."""
+    out = []
+    for mains in MAINS_HZ:
+        orders = [(t, round(t.frequency_hz / mains)) for t in found]
+        own = [(t, k) for t, k in orders if mains_order(t.frequency_hz, 0.0) == (k, mains)]
+        if own:
+            base = float(np.median([t.frequency_hz / k for t, k in own]))
+            out += [k * base for k in range(1, MAINS_ORDERS + 1)]
+    return out
 
 
 def on_harmonics(views: Sequence[View], known: Sequence[Tone]) -> list[QualityFlag]:
@@ -150,14 +174,20 @@ def derived(peak: Peak, found: Sequence[Peak], view: View) -> bool:
     return False
 
 
-def sightings(searched: Sequence[Lines], frequency_hz: float) -> list[Sighting]:
-    """The runs in which a tone is, if they are most of those that could show it; else none."""
+def sightings(
+    searched: Sequence[Lines], frequency_hz: float, of_mains: bool = False
+) -> list[Sighting]:
+    """The runs in which a tone is, if they are most of those that could show it; else none.
+
+    Unless it is a multiple `of_mains`, two must show it, and SEEN_SHARE of all be able to.
+    """
     seen = [Sighting(s, *s.at(frequency_hz)) for s in searched]
     seen = [s for s in seen if s.ratio >= 0]
     present = [s for s in seen if s.chance < PRESENT and s.where.purity(s.bin) > PURE_KNOWN]
-    if len(present) < 2 or 2 * len(present) <= len(seen):
+    if 2 * len(present) <= len(seen):
         return []
-    return present if len(seen) >= SEEN_SHARE * len(searched) else []
+    enough = len(present) > 1 and len(seen) >= SEEN_SHARE * len(searched)
+    return present if enough or of_mains else []
 
 
 def common(
@@ -173,10 +203,15 @@ def common(
         return None
     amplitude = np.array([velocity(s) for s in present])
     noise = amplitude / np.sqrt([max(s.ratio, 1.0) for s in present])
-    spread = float(np.std(amplitude, ddof=1)) / np.sqrt(amplitude.size)
+    # seen in one run, it may be another in the next one
+    spread = (
+        float(np.std(amplitude, ddof=1)) / np.sqrt(amplitude.size)
+        if amplitude.size > 1
+        else float(amplitude[0]) / 2
+    )
     stderr = max(spread, float(np.sqrt(np.sum(noise**2)) / amplitude.size))
     places = np.array([(s.bin + crest(s.view, s.bin)[0]) * s.view.bin_hz for s in present])
-    wander = float(np.std(places, ddof=1)) / np.sqrt(places.size)
+    wander = float(np.std(places, ddof=1)) / np.sqrt(places.size) if places.size > 1 else 0.0
     first = present[0].view
     placed = float(np.hypot(wander, CREST_BINS * first.bin_hz))
     unit = "m/s" if first.microphones is not None else first.run.signals[first.inputs[0]].unit
@@ -196,7 +231,10 @@ def mains_order(frequency_hz: float, tolerance_hz: float) -> tuple[int, float] |
     """(order, mains frequency) when a frequency is a multiple of 50 or 60 Hz."""
     for mains in MAINS_HZ:
         order = round(frequency_hz / mains)
-        if 1 <= order <= 20 and abs(frequency_hz - order * mains) < tolerance_hz + 0.1 * order:
+        if (
+            1 <= order <= MAINS_ORDERS
+            and abs(frequency_hz - order * mains) < tolerance_hz + 0.1 * order
+        ):
             return order, mains
     return None
 
@@ -210,7 +248,7 @@ def line_flag(sighting: Sighting, frequency_hz: float, consistent: bool) -> Qual
         f"line at {frequency_hz:.2f} Hz, {own[i]:.3g} {view.run.signals[view.inputs[i]].unit} in "
         f"{view.inputs[i]} ({own[i] / view.level[i]:.1e} of the fundamental, "
         f"{10 * np.log10(sighting.ratio):.0f} dB above the noise), "
-        + ("in most runs" if consistent else "in this run alone")
+        + ("in most runs that can show it" if consistent else "in this run alone")
     )
     if mains is not None:
         remedy = f"; {mains[0]} × {mains[1]:g} Hz: look for a ground loop"

@@ -141,7 +141,9 @@ def _lead(pair: _Pair) -> _Led:
         rows = [(*first, *second) for first, second in product(*each)]
         placements, many = pair.placements, SIDE_BY_SIDE
     starts = signed_starts(sought, pair.rough, rows, placements)[:many]
-    return _Led(pair, tuple(polish(sought, pair.rough, starts, (FIRST,), 6)[:3]))
+    # most of them fall behind at once
+    ahead = polish(sought, pair.rough, starts, (FIRST,), 2)[: max(6, many // 4)]
+    return _Led(pair, tuple(polish(sought, pair.rough, ahead, (FIRST,), 4)[:3]))
 
 
 def _lead_on(led: _Led) -> _Led:
