@@ -101,10 +101,10 @@ def in_other_forms(
     if best is None:
         return []
     done = {t.key_of_forms for t in tries if t.adequate}
-    return _in_each_form(best, data, available, run, done)
+    return in_each_form(best, data, available, run, done)
 
 
-def _in_each_form(
+def in_each_form(
     t: Tried,
     data: Dataset,
     available: Sequence[Effect],
@@ -236,7 +236,7 @@ def _in_all_forms(
     for _ in first.effects:
         if current.key_of_forms in done:
             break
-        found = _in_each_form(current, data, available, run)
+        found = in_each_form(current, data, available, run)
         done.add(current.key_of_forms)
         out += found
         best = min(found, key=misfit, default=current)

@@ -16,6 +16,7 @@ from identify.trace.contests import (
     NEAR,
     at_the_same_place,
     eliminate,
+    in_each_form,
     in_other_forms,
     in_their_places,
     led_on,
@@ -208,6 +209,7 @@ class _Searching:
             if good and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
             found = self._scattered(parent.fit.structure, parent.fit)
+            found += _simpler_beside_chance(found, self.data, self.apart, self.run)
             self.tried += [*found, *_without_chance(found, self.data)]
         if not self.explained:
             alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
@@ -268,6 +270,27 @@ def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
             fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.003, 0.0))
             if np.isfinite(fit.chi2):
                 out.append(tried(t.fit.structure.effects, fit, data))
+    return out
+
+
+def _simpler_beside_chance(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """The simpler forms of laws that explain the data with a spread beside them: which form was
+    nearest without it, the scattered runs decided."""
+    out: list[Tried] = []
+    for t in tries:
+        if not t.explains:
+            continue
+        chance = t.effects[-1]
+        assert isinstance(chance, Scatter)
+        assert t.spread is not None
+        law = tried(t.fit.structure.effects, t.fit, t.spread.data)
+        most = {e.name: len(e.parameters) for e in law.effects}
+        forms = [e for e in available if len(e.parameters) < most.get(e.name, 0)]
+        for simpler in in_each_form(law, t.spread.data, forms, run):
+            if simpler.adequate:
+                out += try_scatters(simpler.fit.structure, data, simpler.fit, [chance], run)
     return out
 
 
