@@ -520,6 +520,10 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME], InProcess())[0]
     kept = against_chance([beside])[0]
     assert (kept.plausible, against_chance([law, beside])[1].plausible) == (True, False)
+    # as likely as another spread it is a rival, where its law predicts the held-out runs
+    other = replace(beside, effects=(DRIVE,))
+    assert trace.rivals(other, [beside]) == [beside]
+    assert trace.rivals(other, [replace(beside, validation_p=1e-17)]) == []
 
 
 def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(

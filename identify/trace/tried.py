@@ -146,9 +146,9 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     """Adequate, plausible sets of other effects that the data do not rule out against `best`.
 
     What only adds an effect to one of them is none of its own. Among spreads the likelihood alone
-    decides: how well the wanderings of a few runs fit a Gaussian says little of their cause. A law
-    may follow what chance did where a spread is about as likely, or likelier though it looks not
-    quite random.
+    decides: how well the wanderings of a few runs fit a Gaussian says little of their cause; a law
+    beside one must predict the held-out runs. A law may follow what chance did where a spread is
+    about as likely, or likelier though it looks not quite random.
     """
     found = [
         t
@@ -166,7 +166,7 @@ def _chance_rivals(spread: Tried, best: Tried) -> bool:
     if spread.spread is None:
         return False
     if best.spread is not None:
-        return spread.plausible
+        return spread.plausible and (spread.adequate or len(spread.effects) == 1)
     random = spread.spread.objection in ("", BEATEN)
     return spread.adequate and spread.evidence < best.evidence + (EVIDENCE if random else 0.0)
 
