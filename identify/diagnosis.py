@@ -290,7 +290,7 @@ def _judge(
             f"Adding {words} takes away all but a trace of the misfit and predicts the validation "
             f"runs as well as noise permits; χ²/dof {near.fit.chi2_per_dof:.2g} is left."
         )  # fmt: skip
-    chosen = _foremost(ranked)
+    chosen = trace.foremost(ranked)
     left = "" if chosen is None else (
         f" The best, {chosen.words}, leaves χ²/dof {chosen.fit.chi2_per_dof:.3g}; "
         "it is reported, not claimed."
@@ -327,15 +327,6 @@ def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried |
     ):
         return best
     return None
-
-
-def _foremost(ranked: Sequence[Tried]) -> Tried | None:
-    """The best of candidates that do not explain the data: the fewest effects that leave no more
-    than three times as much as any do. More of them take up more of whatever there is."""
-    if not ranked:
-        return None
-    near = [t for t in ranked if t.fit.chi2 < 3 * ranked[0].fit.chi2]
-    return min(near, key=lambda t: (len(t.effects), t.fit.chi2))
 
 
 def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:

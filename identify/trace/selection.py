@@ -32,8 +32,10 @@ from identify.trace.tried import (
     EVIDENCE,
     GROSS,
     Tried,
+    accounts,
     best_by_name,
     best_form,
+    foremost,
     misfit,
     tried,
 )
@@ -224,11 +226,23 @@ class _Searching:
         return try_scatters(structure, self.data, base, self.scatters, self.run, most)
 
     def contest(self) -> None:
-        """What might do as well as the best is tried before it is claimed."""
-        data, run = self.data, self.run
+        """What might do as well as the best is tried before it is claimed, and, where nothing can
+        be, the foremost of what does not explain the data in other forms."""
         if not self.explained:
             certain = [t for t in self.tried if t.spread is None]
-            self.tried += reformed(certain, data, self.available, run, self.done)
+            self.tried += reformed(certain, self.data, self.available, self.run, self.done)
+        self._contest()
+        claimed = any(t.explains and accounts(t, self.base, self.tried) for t in self.tried)
+        first = foremost([t for t in self.tried if t.spread is None and t.plausible])
+        if self.explained and not claimed and first is not None and not first.explains:
+            self.report(0.95, "trying other forms of the foremost")
+            others = reformed([first], self.data, self.available, self.run, self.done)
+            self.tried += others
+            if any(t.explains for t in others):
+                self._contest()
+
+    def _contest(self) -> None:
+        data, run = self.data, self.run
         several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
         if any(t.explains for t in several):
             self.tried += in_other_forms(several, data, self.available, run)

@@ -142,6 +142,14 @@ def _merit(t: Tried) -> tuple[bool, float]:
     return not good, t.evidence + handicap if good else t.fit.chi2
 
 
+def foremost(tries: Sequence[Tried]) -> Tried | None:
+    """The best of sets that may not explain the data: the fewest effects that leave no more than
+    three times as much as any do. More of them take up more of whatever there is."""
+    least = min((t.fit.chi2 for t in tries), default=np.inf)
+    near = [t for t in tries if t.fit.chi2 <= 3 * least]
+    return min(near, key=lambda t: (len(t.effects), t.fit.chi2), default=None)
+
+
 def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     """Adequate, plausible sets of other effects that the data do not rule out against `best`.
 
