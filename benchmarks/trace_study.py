@@ -214,7 +214,9 @@ def outcome(r: dict[str, Any]) -> str:
             return "another name, right place"
         return "right in part" if set(claimed) < set(truth) else "WRONG"
     if r["verdict"] == "ambiguous":
-        return "ambiguous" if truth in [sorted(b) for b in r["best"]] else "ambiguous, truth out"
+        # foreign tones are claimed beside whatever else is
+        rest = [n for n in truth if n != "interference" or n not in claimed]
+        return "ambiguous" if rest in [sorted(b) for b in r["best"]] else "ambiguous, truth out"
     if r["verdict"] == "unexplained":
         if not r["mode"].startswith("leftout"):
             return "unexplained"

@@ -438,6 +438,11 @@ def test_a_claim_takes_most_of_the_misfit_away(
     # nor what predicts the held-out runs worse than a part of it does
     worse = replace(both, validation_error=1.5e-3)
     assert not trace.accounts(worse, gross, [skew, worse])
+    # a little worse may be noise's doing, unless the chance of it says otherwise
+    little = replace(both, validation_error=1.1e-3)
+    assert trace.accounts(little, gross, [skew, little]) is accounted
+    unlikely = replace(little, validation_p=0.1)
+    assert not trace.accounts(unlikely, gross, [skew, unlikely])
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
+WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 
 
@@ -219,8 +220,15 @@ def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
         alone = [o.evidence for o in tries if o.spread and o.parts < t.parts]
         least = min([_evidence(without), *alone])
         return left < excess / 3 and t.evidence < least - EVIDENCE
-    worse = any(o.validation_error < t.validation_error for o in fewer)
+    worse = any(_predicts_worse(t, o) for o in fewer)
     return gain_p(t, without) < ALPHA and left < excess / 3 and not worse
+
+
+def _predicts_worse(t: Tried, o: Tried) -> bool:
+    """Whether `t` predicts the held-out runs worse than `o`: much, or a little and not by chance
+    either. Near the noise a few runs decide nothing."""
+    more = t.validation_error / o.validation_error
+    return more > WORSE or (more > 1.0 and t.validation_p < o.validation_p)
 
 
 def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
