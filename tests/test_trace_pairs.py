@@ -55,6 +55,30 @@ def test_where_no_single_effect_comes_near_pairs_are_sought_at_once(tmp_path: Pa
     assert abs(delay.value - DELAY_S) < 4 * delay.stderr
 
 
+def test_an_offset_is_seen_in_a_further_mode_too(tmp_path: Path) -> None:
+    """Two modes are declared: a form for three of them is there beside an effect that brings one,
+    and only there."""
+    mode = {
+        "frequency_hz": 491.5,
+        "damping": 0.05,
+        "flame_residue_ratio": -0.094,
+        "speaker_residue_ratio": -0.094,
+    }
+    effects = {"sensor_offset": {"offset_m": -0.0106}, "acoustic_mode": mode}
+    ready = thesis_campaign(tmp_path, 735, effects, noise_db=45.0)
+    keys = {"acoustic_mode:mode", "sensor_offset:modal_3"}
+    base = start.fit_from_data(ready.structure, ready.data)
+    catalogue = [by_key(k) for k in sorted({*keys, "sensor_offset:modal_2"})]
+    tried = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
+    best = trace.best_form([t for t in tried if t.explains])
+    assert set(best.key_of_forms) == keys
+    without = [
+        t for t in tried if t.key_of_forms == ("acoustic_mode:mode", "sensor_offset:modal_2")
+    ]
+    assert all(t.fit.chi2 > 5 * best.fit.chi2 for t in without)
+    assert not any(t.key_of_forms == ("sensor_offset:modal_3",) for t in tried)
+
+
 def test_which_forms_stand_for_others() -> None:
     """Those listed, the best singles', and the first of an effect without one."""
     assert {e.key for e in CATALOGUE} >= STANDING

@@ -42,7 +42,7 @@ REFINED = 1500  # iterations of a form that refines another: a long valley may l
 LED_ON = 4  # of the best of a level that had not converged …
 FARTHEST = 300  # … by so many iterations more
 REFORMED = 3  # sets of effects of which other forms are tried: the best one, and others …
-NEAR = 30.0  # … that leave no more than so much χ²/dof …
+NEAR = 100.0  # … that leave no more than so much χ²/dof …
 BEHIND = 3.0  # … and, where forms of a better one explain the data, than so many times its χ²
 
 
@@ -120,6 +120,7 @@ def in_each_form(
             for form in available
             if form.name == e.name
             and form.key != e.key
+            and suits(form, t.fit.structure, kept)
             and not (form.refines and t.explains)
             and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
             and key_of_forms((*kept, form)) not in done
@@ -127,6 +128,14 @@ def in_each_form(
     items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
     fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
     return [tried(fit.structure.effects, fit, data) for fit in fits]
+
+
+def suits(form: Effect, structure: Structure, beside: Sequence[Effect]) -> bool:
+    """Whether a form is for as many modes as are declared, or as there are with those of an effect
+    that it stands beside."""
+    plain = replace(structure, effects=())
+    fuller = [r.mode_count for e in beside if (r := e.restated(plain)) is not None]
+    return form.mode_count in (None, plain.mode_count, *fuller)
 
 
 def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) -> Fit | None:

@@ -22,6 +22,7 @@ from identify.trace.contests import (
     led_on,
     reformed,
     settled,
+    suits,
     with_fewer,
 )
 from identify.trace.pairs import pairs_from_afar
@@ -44,6 +45,7 @@ Progress = Callable[[float, str], None]
 
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
+STANDS_OUT = 30.0  # times less misfit than with any other effect
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
 
@@ -81,6 +83,7 @@ def search(
         executor or InProcess(),
         progress or (lambda share, text: None),
         tuple(e for e in catalogue if usable(e, data, structure)),
+        _fuller(catalogue, data, structure),
         tuple(e for e in catalogue if isinstance(e, Scatter)),
     )
     singles = going.alone(scores)
@@ -91,7 +94,7 @@ def search(
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
-        nowhere = size == 2 and _least(singles) > GROSS  # no single is a place to grow from
+        nowhere = size == 2 and not _a_place_to_grow_from(singles)
         found = going.pairs(singles) if nowhere else going.grown(parents)
         if size == 2:
             going.with_chance(parents)
@@ -115,6 +118,7 @@ class _Searching:
     run: Executor
     report: Progress
     available: tuple[Effect, ...]
+    fuller: tuple[Effect, ...]  # forms for one mode more, beside an effect that brings it
     scatters: tuple[Scatter, ...]
     tried: list[Tried] = field(default_factory=list)
     extended: set[tuple[str, ...]] = field(default_factory=lambda: {()})  # keys: grown from …
@@ -124,6 +128,11 @@ class _Searching:
     def apart(self) -> list[Effect]:
         """The forms that need no other to start from."""
         return [e for e in self.available if not e.refines]
+
+    @property
+    def forms(self) -> tuple[Effect, ...]:
+        """All forms, beside whatever they may stand."""
+        return (*self.available, *self.fuller)
 
     @property
     def explained(self) -> bool:
@@ -177,7 +186,11 @@ class _Searching:
         far = self.base.chi2_per_dof > GROSS and not self.explained
         for parent in parents:
             self.extended.add(parent.key_of_forms)
-            rest = [e for e in self.apart if e.name not in parent.names]
+            rest = [
+                e
+                for e in (*self.apart, *self.fuller)
+                if e.name not in parent.names and suits(e, self.structure, parent.effects)
+            ]
             grown += try_effects(
                 parent.fit.structure, self.data, parent.fit, rest, executor=self.run, keep=5,
                 far=False, progress=lambda share, text: self.report(0.6 + 0.35 * share, text),
@@ -199,7 +212,7 @@ class _Searching:
         out = [*grown, *led_on(grown, self.data, self.run)]
         if not any(t.explains for t in out):
             self.report(0.6, "trying other forms of the best")
-            others = reformed(out, self.data, self.available, self.run, self.done)
+            others = reformed(out, self.data, self.forms, self.run, self.done)
             out += [*others, *led_on(others, self.data, self.run)]
         return out
 
@@ -230,13 +243,13 @@ class _Searching:
         be, the foremost of what does not explain the data in other forms."""
         if not self.explained:
             certain = [t for t in self.tried if t.spread is None]
-            self.tried += reformed(certain, self.data, self.available, self.run, self.done)
+            self.tried += reformed(certain, self.data, self.forms, self.run, self.done)
         self._contest()
         claimed = any(t.explains and accounts(t, self.base, self.tried) for t in self.tried)
         first = foremost([t for t in self.tried if t.spread is None and t.plausible])
         if self.explained and not claimed and first is not None and not first.explains:
             self.report(0.95, "trying other forms of the foremost")
-            others = reformed([first], self.data, self.available, self.run, self.done)
+            others = reformed([first], self.data, self.forms, self.run, self.done)
             self.tried += others
             if any(t.explains for t in others):
                 self._contest()
@@ -245,12 +258,19 @@ class _Searching:
         data, run = self.data, self.run
         several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
         if any(t.explains for t in several):
-            self.tried += in_other_forms(several, data, self.available, run)
+            self.tried += in_other_forms(several, data, self.forms, run)
         near = at_the_same_place(several, data, self.available, run)
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
         self.tried += settled(self.tried, data, run)
+
+
+def _a_place_to_grow_from(singles: Sequence[Tried]) -> bool:
+    """Whether the best single leaves little, or so much less than any other that it is surely part
+    of the matter."""
+    best = [t.fit.chi2_per_dof for t in best_by_name(singles)]
+    return bool(best) and (best[0] <= GROSS or STANDS_OUT * best[0] < min([*best[1:], np.inf]))
 
 
 def _least(tries: Sequence[Tried]) -> float:
@@ -418,6 +438,14 @@ def refitted(tries: Sequence[Tried], data: Dataset, keep: int = 6) -> list[Tried
         if np.isfinite(fit.chi2):
             out.append(tried(t.effects, fit, data))
     return out
+
+
+def _fuller(catalogue: Sequence[Effect], data: Dataset, structure: Structure) -> tuple[Effect, ...]:
+    """Forms for one mode more than declared that are not there for the declared ones."""
+    more = replace(structure, mode_count=structure.mode_count + 1)
+    known = {e.key for e in catalogue if usable(e, data, structure)}
+    found = [e for e in catalogue if e.mode_count is not None and usable(e, data, more)]
+    return tuple(e for e in found if e.key not in known and not e.refines)
 
 
 def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
