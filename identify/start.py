@@ -43,7 +43,7 @@ FloatArray = npt.NDArray[np.float64]
 
 SHARES = (1e-3, 1e-2, 0.0)  # share of a coefficient's size that its weight counts as noise
 SCAN = 24  # assumed flame poles
-DENSE = 24  # starts that are polished where sparser ones led nowhere
+DENSE = 96  # starts that are polished where sparser ones led nowhere
 DISTANT = 40  # of those from the slow flow, of either sign, where the declared fit went astray
 NEARLY = 100.0  # χ²/dof beyond which the model is to blame, not a mode at the wrong place
 WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_weak_pulls`
