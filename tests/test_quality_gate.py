@@ -290,6 +290,18 @@ def test_a_tone_on_a_harmonic_counts_there_as_noise(
     assert not found.doubted  # the run's other harmonics are as good as ever
 
 
+@pytest.mark.parametrize("frequency", [165.5, 172.3])
+def test_a_tone_among_the_forcing_frequencies_stands_still(
+    clean: Campaign, frequency: float
+) -> None:
+    """In one run it might be what drive and free cycle combine to; that moves with the drive."""
+    found = inspect(edited(clean, line(frequency, 1.0)))
+    assert [t.frequency_hz for t in found.tones] == [pytest.approx(frequency, abs=0.05)]
+    spoilt = {f.run for f in found.flags if f.flag == "tone_on_harmonic"}
+    assert spoilt == {min(clean.runs[1:], key=lambda r: abs(r.frequency_hz - frequency)).name}
+    assert not found.excluded
+
+
 def test_a_multiple_of_the_mains_is_believed_where_one_run_shows_it() -> None:
     """Forced at and around 180 Hz: of its third multiple only the free run shows anything."""
     rng = np.random.default_rng(8)

@@ -22,6 +22,7 @@ PEAK = 25.0  # power over noise of a peak that may be a line
 SMALLEST = 1e-6  # re the fundamental: below, it is arithmetic
 STEPS = 0.1  # re the converter's step: below, it is quantisation
 LOWEST_HZ = 5.0
+RESOLVED = 2  # bins on either side of a line, beyond which another one is seen
 FOLDED = 60  # harmonics whose folded images are expected
 
 
@@ -60,9 +61,9 @@ class Lines:
         return peak, float(self.ratio[peak])
 
 
-def lines(view: View, free: FreeLine | None) -> Lines:
+def lines(view: View, free: FreeLine | None, combinations: bool = True) -> Lines:
     power = np.abs(view.spectrum) ** 2
-    usable = expected(view, free)
+    usable = expected(view, free, combinations)
     ratio = np.zeros(power.shape)
     for i, name in enumerate(view.inputs):
         noise = local_noise(power[i], usable)
@@ -72,8 +73,12 @@ def lines(view: View, free: FreeLine | None) -> Lines:
     return Lines(view, usable, ratio.max(axis=0), np.where(usable, view.relative_power, 0.0))
 
 
-def expected(view: View, free: FreeLine | None) -> BoolArray:
-    """Bins (bins,) where no line of the rig's own is expected: True where one may search."""
+def expected(view: View, free: FreeLine | None, combinations: bool = True) -> BoolArray:
+    """Bins (bins,) where no line of the rig's own is expected: True where one may search.
+
+    Without `combinations`, of what the free cycle brings only its own line counts, no wider than it
+    is: what combines with the drive lies elsewhere in a run at another frequency.
+    """
     count, width, rate = view.spectrum.shape[1], view.bin_hz, view.run.sample_rate_hz
     usable = np.ones(count, dtype=bool)
     usable[: max(8, int(np.ceil(LOWEST_HZ / width)))] = False
@@ -89,7 +94,9 @@ def expected(view: View, free: FreeLine | None) -> BoolArray:
     unfolded = harmonics < rate / 2
     hide(harmonics[unfolded], 2 * MAIN_LOBE)
     hide(harmonics[~unfolded], 2)
-    if free is not None and view.run.kind != "free":
+    if free is not None and not combinations:
+        hide(free.frequency_hz * np.arange(1, 8), RESOLVED)
+    elif free is not None and view.run.kind != "free":
         beat = free.frequency_hz - view.frequency_hz
         cycle = free.frequency_hz * np.arange(1, 8)
         mixed = [harmonics[:7] + m * beat for m in (-3, -2, -1, 1, 2, 3)]

@@ -4,6 +4,9 @@ A line is interference when it stands at the same frequency, to within a bin, in
 the runs where it could be seen. A rig's own narrow resonance, shaken by turbulence, peaks
 elsewhere in every run: where such scattered peaks surround it, a line is not believed.
 
+What the free cycle and the drive combine to moves with the drive, and a line among all that, where
+no single run could tell it apart, is foreign where most runs have it at the same place.
+
 A line of the mains brings its multiples. One of those is believed wherever the rig's own lines
 leave it to be seen, be it in a single run: forced at three times 50 Hz, no run shows what it takes
 for its own.
@@ -35,6 +38,7 @@ OWN = 0.2  # of the run's frequency, next to which the rig's own resonance stand
 ORDERS = 200  # harmonics of a discontinuous loop that may fold into the band
 LEAST_ALONE = 5e-4  # of the fundamental: a smaller line in one run harms nothing
 SEEN_SHARE = 0.4  # of the runs in which a tone must not be hidden by the rig's own lines
+DIFFERENT = 4  # forcing frequencies, at least, of runs that have a line at the same place
 MAINS_HZ = (50.0, 60.0)
 MAINS_ORDERS = 20
 
@@ -101,14 +105,34 @@ def tones(
             if lone and abs(p.frequency_hz - own) > OWN * own and not derived(p, found, where.view):
                 sighting = Sighting(where, p.bin, p.ratio)
                 flags.append(line_flag(sighting, p.frequency_hz, False))
+
+    def add(where: Sequence[Lines], frequency: float, present: Sequence[Sighting]) -> None:
+        known = any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out)
+        tone = common(where, frequency, present) if present and not known else None
+        if tone is not None:
+            out.append(tone)
+            flags.extend(line_flag(s, frequency, True) for s in present)
+
     for frequency in multiples(out):
-        if not any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out):
-            present = sightings(searched, frequency, of_mains=True)
-            tone = common(searched, frequency, present) if present else None
-            if tone is not None:
-                out.append(tone)
-                flags += [line_flag(s, frequency, True) for s in present]
+        add(searched, frequency, sightings(searched, frequency, credible=True))
+    bare = [lines(v, free, combinations=False) for v in views]
+    for frequency in constant(bare, SAME_BINS * width):
+        add(bare, frequency, sightings(bare, frequency, credible=True))
     return tuple(out), flags
+
+
+def constant(searched: Sequence[Lines], width_hz: float) -> list[float]:
+    """Frequencies at which runs have a line, forced as they are at different ones."""
+    found = [p for i, s in enumerate(searched) for p in peaks(s, i)]
+    out = []
+    for members in clusters([p for p in found if p.purity > PURE], width_hz):
+        runs = {p.run for p in members}
+        forced = {searched[i].view.frequency_hz for i in runs}
+        frequency = float(np.median([p.frequency_hz for p in members]))
+        around = scattered(found, frequency, width_hz / SAME_BINS)
+        if len(forced) >= DIFFERENT and 4 * around <= len(runs):
+            out.append(frequency)
+    return out
 
 
 def multiples(found: Sequence[Tone]) -> list[float]:
@@ -175,11 +199,11 @@ def derived(peak: Peak, found: Sequence[Peak], view: View) -> bool:
 
 
 def sightings(
-    searched: Sequence[Lines], frequency_hz: float, of_mains: bool = False
+    searched: Sequence[Lines], frequency_hz: float, credible: bool = False
 ) -> list[Sighting]:
     """The runs in which a tone is, if they are most of those that could show it; else none.
 
-    Unless it is a multiple `of_mains`, two must show it, and SEEN_SHARE of all be able to.
+    Unless there is more to say for it, two must show it, and SEEN_SHARE of all be able to.
     """
     seen = [Sighting(s, *s.at(frequency_hz)) for s in searched]
     seen = [s for s in seen if s.ratio >= 0]
@@ -187,7 +211,7 @@ def sightings(
     if 2 * len(present) <= len(seen):
         return []
     enough = len(present) > 1 and len(seen) >= SEEN_SHARE * len(searched)
-    return present if enough or of_mains else []
+    return present if enough or credible else []
 
 
 def common(
