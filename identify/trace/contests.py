@@ -36,7 +36,8 @@ ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[float, str], None]
 
-UNSETTLED = 60.0  # of χ² + p ln n: within that, what has not converged may yet be a rival
+UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
+RUNNERS_UP = 2  # sets whose other forms are tried for that
 NEARBY = 0.7  # of the logarithm, where another form is matched
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
 LED_ON = 4  # of the best of a level that had not converged …
@@ -252,6 +253,35 @@ def _in_all_forms(
         if best.explains or best.fit.chi2 >= current.fit.chi2 - EVIDENCE:
             break
         current = best
+    return out
+
+
+def runners_up(
+    tries: Sequence[Tried],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    done: set[tuple[str, ...]],
+) -> list[Tried]:
+    """What comes near to several effects that explain the data, in other forms of what it has in
+    the place of one of them: a search of sets refits but the forms that seem best from afar."""
+    certain = [t for t in tries if t.spread is None]
+    good = [t for t in certain if t.explains]
+    if not good:
+        return []
+    best = best_form(good)
+    near = [
+        t
+        for t in best_by_name(certain)
+        if not t.explains
+        and len(t.effects) == len(best.effects) > 1
+        and t.evidence < best.evidence + UNSETTLED
+        and t.key_of_forms not in done
+    ]
+    out: list[Tried] = []
+    for t in near[:RUNNERS_UP]:
+        done.add(t.key_of_forms)
+        out += in_each_form(t, data, [e for e in available if e.name not in best.names], run)
     return out
 
 

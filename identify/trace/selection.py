@@ -21,6 +21,7 @@ from identify.trace.contests import (
     in_their_places,
     led_on,
     reformed,
+    runners_up,
     settled,
     suits,
     with_fewer,
@@ -259,6 +260,7 @@ class _Searching:
         several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
         if any(t.explains for t in several):
             self.tried += in_other_forms(several, data, self.forms, run)
+        self.tried += runners_up(self.tried, data, self.forms, run, self.done)
         near = at_the_same_place(several, data, self.available, run)
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
