@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
-from simulated_rig import build_config, make_effect
+from simulated_rig import build_config, campaigns, make_effect
 from simulated_rig.campaigns import (
     PlannedRun,
     plan_campaign,
@@ -57,6 +57,26 @@ def test_recordings_are_settled_and_pure() -> None:
         spectrum = np.abs(np.fft.rfft(run.velocity)) / 10000
         spectrum[:: round(2 * frequency)] = 0.0
         assert spectrum.max() < 1e-6
+
+
+def test_corners_are_not_met_at_one_place_of_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 160 Hz every period of 4000 steps would have the dead zone's edges at the same places of a
+    step: what the two microphones give of the velocity was 2e-5 wrong there, elsewhere 1e-7."""
+    config = make_effect("nonlinearity_shape/dead_zone", {"dead_zone_width": 0.026}).apply(
+        build_config(noise_db=140.0)
+    )
+    tried: list[float] = []
+
+    def condition(config: object, cycle: object, frequency: float, *_: float) -> PlannedRun:
+        tried.append(frequency)
+        return PlannedRun("forced", frequency, 1.0)
+
+    monkeypatch.setattr(campaigns, "_condition", condition)
+    plan_campaign(config, seed=3, forced=20, validation=2)
+    assert {159.0, 161.0} <= set(tried)
+    assert 160.0 not in tried
+    plan_campaign(build_config(), seed=3, forced=20, validation=3)
+    assert 160.0 in tried
 
 
 def test_an_unlocked_condition_never_settles() -> None:
