@@ -5,7 +5,7 @@ the runs where it could be seen. A rig's own narrow resonance, shaken by turbule
 elsewhere in every run: where such scattered peaks surround it, a line is not believed.
 
 What the free cycle and the drive combine to moves with the drive, and a line among all that, where
-no single run could tell it apart, is foreign where most runs have it at the same place.
+no single run could tell it apart, is foreign where runs at several forcings have it at one place.
 
 A line of the mains brings its multiples. One of those is believed wherever the rig's own lines
 leave it to be seen, be it in a single run: forced at three times 50 Hz, no run shows what it takes

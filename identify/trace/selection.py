@@ -13,7 +13,6 @@ from identify.fit import Fit, fit_orbits
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
-    NEAR,
     at_the_same_place,
     eliminate,
     in_each_form,
@@ -46,6 +45,7 @@ Progress = Callable[[float, str], None]
 
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
+MUCH = 30.0  # χ²/dof that grown pairs leave, beyond which all pairs are sought from afar
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
@@ -99,7 +99,7 @@ def search(
         found = going.pairs(singles) if nowhere else going.grown(parents)
         if size == 2:
             going.with_chance(parents)
-            if not nowhere and base.chi2_per_dof > GROSS and _least(found) > NEAR:
+            if not nowhere and base.chi2_per_dof > GROSS and _least(found) > MUCH:
                 found += going.pairs(singles)
         level = best_by_name(found)
     going.contest()
@@ -257,10 +257,10 @@ class _Searching:
 
     def _contest(self) -> None:
         data, run = self.data, self.run
+        self.tried += runners_up(self.tried, data, self.forms, run, self.done)
         several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
         if any(t.explains for t in several):
             self.tried += in_other_forms(several, data, self.forms, run)
-        self.tried += runners_up(self.tried, data, self.forms, run, self.done)
         near = at_the_same_place(several, data, self.available, run)
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
