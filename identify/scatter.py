@@ -45,7 +45,7 @@ SMALLEST = 1e-8
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
 HOPELESS = 5.0  # χ² a residual beyond which further rounds, or less noise, mend nothing …
 FAR = 30.0  # … and at first, when σ is no more than a guess
-WIDER = 3.0  # of the sizes that lead in: what a run may deviate by
+WIDER = 3.0  # times the σ that leads in by which every run may deviate, as yet at that price
 LEADING = 10.0  # typical sizes of each direction that the lead-in allows
 ASTRAY = 300.0  # χ²/dof beyond which the base fit is no place to start from alone
 #: How they are led in: harmonics, share of noise, Newton steps, and how many are kept.
@@ -83,13 +83,13 @@ def fit_scatter(
     data: Dataset,
     base: Fit,
     scatter: Scatter,
-    least: float = np.inf,
+    most: float = np.inf,
 ) -> Spread | None:
     """Fit `structure` with a scatter on top, from the fit `base` without it, and from the slow flow
     where that one is no place to start from.
 
     None where there are too few runs, or no likelihood that is finite, or where χ² and penalty stay
-    beyond `least`.
+    beyond `most`.
     """
     forced = sum(b.runs for b in data.fit if not b.free)
     if forced < LEAST_RUNS or not np.isfinite(base.chi2):
@@ -101,7 +101,7 @@ def fit_scatter(
     found = []
     for begin in starts:
         try:
-            spread = _alternate(structure, data, own, begin, scatter, least)
+            spread = _alternate(structure, data, own, begin, scatter, most)
         except np.linalg.LinAlgError:  # V is singular to rounding: σ beyond all measure
             spread = None
         if spread is not None:
@@ -145,7 +145,7 @@ def _alternate(
     own: Own,
     starts: FloatArray,
     scatter: Scatter,
-    least: float,
+    most: float,
 ) -> Spread | None:
     sizes, settled = _guess(own), False
     for i in range(ROUNDS):
@@ -153,8 +153,7 @@ def _alternate(
         if not found or found[0].cost > (FAR if i == 0 else HOPELESS) * data.residuals:
             return None
         led = found[0]
-        # at first what runs deviate by may be some times what it is held to
-        if led.cost > least + (WIDER**2 * len(own.parameters) if i == 0 else 0.0):
+        if led.cost > most + (WIDER**2 * len(own.parameters) if i == 0 else 0.0):
             return None
         rows = [_rows(structure, led.theta, own.placed(b, led.own), scatter) for b in data.fit]
         if not _finite(rows):

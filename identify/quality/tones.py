@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from identify.chances import chi2_tail
 from identify.harmonics import harmonic_under
@@ -25,6 +26,8 @@ from identify.quality.lines import Lines, Peak, crest, lines, peaks
 from identify.quality.spectrum import tail
 from identify.quality.view import View
 from identify.results import QualityFlag
+
+FloatArray = npt.NDArray[np.float64]
 
 ALONE = 100.0  # power over noise of a line that is named though no other run has it
 PURE = 4.0  # power over that of the bins beside it, of a line; of one found alone twice that
@@ -75,6 +78,19 @@ class Sighting:
         return min(1.0, 3 * float(tail(self.ratio)))
 
 
+@dataclass(frozen=True)
+class Place:
+    """Peaks that belong together, and how many scattered ones surround them."""
+
+    frequency_hz: float
+    members: tuple[Peak, ...]
+    around: int
+
+    @property
+    def runs(self) -> frozenset[int]:
+        return frozenset(p.run for p in self.members)
+
+
 def tones(
     views: Sequence[View], free: FreeLine | None
 ) -> tuple[tuple[Tone, ...], list[QualityFlag]]:
@@ -86,64 +102,77 @@ def tones(
     width = float(np.median([v.bin_hz for v in views]))
     out: list[Tone] = []
     flags: list[QualityFlag] = []
-    for members in clusters([p for p in found if p.purity > PURE], SAME_BINS * width):
-        frequency = float(np.median([p.frequency_hz for p in members]))
-        around = scattered(found, frequency, width)
-        present = sightings(searched, frequency)
-        if len({p.run for p in members}) > 1 and present and 4 * around <= len(present):
-            tone = common(searched, frequency, present)
+    for place in places(found, width):
+        seen = seen_at(searched, place.frequency_hz)
+        present = present_in(seen)
+        most = len(present) > 1 and len(seen) >= SEEN_SHARE * len(searched)
+        if most and len(place.runs) > 1 and 4 * place.around <= len(present):
+            tone = common(place.frequency_hz, seen, present)
             if tone is not None:
                 out.append(tone)
-                flags += [line_flag(s, frequency, True) for s in present]
+                flags += [line_flag(s, place.frequency_hz, True) for s in present]
                 continue
-        for p in members:
-            lone = p.ratio > ALONE and p.purity > 2 * PURE and around == 0
-            where = searched[p.run]
-            own = where.view.frequency_hz
-            level = np.abs(where.view.spectrum[:, p.bin]) / np.maximum(where.view.level, 1e-300)
-            lone = lone and bool(level.max() > LEAST_ALONE)
-            if lone and abs(p.frequency_hz - own) > OWN * own and not derived(p, found, where.view):
-                sighting = Sighting(where, p.bin, p.ratio)
-                flags.append(line_flag(sighting, p.frequency_hz, False))
-
-    def add(where: Sequence[Lines], frequency: float, present: Sequence[Sighting]) -> None:
-        known = any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out)
-        tone = common(where, frequency, present) if present and not known else None
+        alone = [p for p in place.members if lone(p, place, found, searched[p.run].view)]
+        flags += [
+            line_flag(Sighting(searched[p.run], p.bin, p.ratio), p.frequency_hz, False)
+            for p in alone
+        ]
+    bare = [lines(v, free, combinations=False) for v in views]
+    credible = [(searched, f) for f in multiples(out)] + [(bare, f) for f in constant(bare, width)]
+    for where, frequency in credible:
+        if any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out):
+            continue
+        seen = seen_at(where, frequency)
+        present = present_in(seen)
+        tone = common(frequency, seen, present) if present else None
         if tone is not None:
             out.append(tone)
-            flags.extend(line_flag(s, frequency, True) for s in present)
-
-    for frequency in multiples(out):
-        add(searched, frequency, sightings(searched, frequency, credible=True))
-    bare = [lines(v, free, combinations=False) for v in views]
-    for frequency in constant(bare, SAME_BINS * width):
-        add(bare, frequency, sightings(bare, frequency, credible=True))
+            flags += [line_flag(s, frequency, True) for s in present]
     return tuple(out), flags
+
+
+def places(found: Sequence[Peak], width_hz: float) -> list[Place]:
+    """Where pure peaks of several runs, or of one, lie together, in bins of `width_hz`."""
+    out = []
+    for members in clusters([p for p in found if p.purity > PURE], SAME_BINS * width_hz):
+        frequency = float(np.median([p.frequency_hz for p in members]))
+        out.append(Place(frequency, tuple(members), scattered(found, frequency, width_hz)))
+    return out
+
+
+def lone(peak: Peak, place: Place, found: Sequence[Peak], view: View) -> bool:
+    """Whether a line that no other run has is to be named all the same."""
+    own = view.frequency_hz
+    level = np.abs(view.spectrum[:, peak.bin]) / np.maximum(view.level, 1e-300)
+    return (
+        peak.ratio > ALONE
+        and peak.purity > 2 * PURE
+        and place.around == 0
+        and bool(level.max() > LEAST_ALONE)
+        and abs(peak.frequency_hz - own) > OWN * own
+        and not derived(peak, found, view)
+    )
 
 
 def constant(searched: Sequence[Lines], width_hz: float) -> list[float]:
     """Frequencies at which runs have a line, forced as they are at different ones."""
     found = [p for i, s in enumerate(searched) for p in peaks(s, i)]
     out = []
-    for members in clusters([p for p in found if p.purity > PURE], width_hz):
-        runs = {p.run for p in members}
-        forced = {searched[i].view.frequency_hz for i in runs}
-        frequency = float(np.median([p.frequency_hz for p in members]))
-        around = scattered(found, frequency, width_hz / SAME_BINS)
-        if len(forced) >= DIFFERENT and 4 * around <= len(runs):
-            out.append(frequency)
+    for place in places(found, width_hz):
+        forced = {searched[i].view.frequency_hz for i in place.runs}
+        if len(forced) >= DIFFERENT and 4 * place.around <= len(place.runs):
+            out.append(place.frequency_hz)
     return out
 
 
 def multiples(found: Sequence[Tone]) -> list[float]:
     """Multiples of the mains' frequency, where a line of it has been found, in Hz."""
     out = []
+    orders = [(t.frequency_hz, mains_order(t.frequency_hz, 0.0)) for t in found]
     for mains in MAINS_HZ:
-        orders = [(t, round(t.frequency_hz / mains)) for t in found]
-        own = [(t, k) for t, k in orders if mains_order(t.frequency_hz, 0.0) == (k, mains)]
+        own = [f / order[0] for f, order in orders if order is not None and order[1] == mains]
         if own:
-            base = float(np.median([t.frequency_hz / k for t, k in own]))
-            out += [k * base for k in range(1, MAINS_ORDERS + 1)]
+            out += [k * float(np.median(own)) for k in range(1, MAINS_ORDERS + 1)]
     return out
 
 
@@ -198,50 +227,48 @@ def derived(peak: Peak, found: Sequence[Peak], view: View) -> bool:
     return False
 
 
-def sightings(
-    searched: Sequence[Lines], frequency_hz: float, credible: bool = False
-) -> list[Sighting]:
-    """The runs in which a tone is, if they are most of those that could show it; else none.
-
-    Unless there is more to say for it, two must show it, and SEEN_SHARE of all be able to.
-    """
+def seen_at(searched: Sequence[Lines], frequency_hz: float) -> list[Sighting]:
+    """What there is at a frequency in each of the runs whose own lines do not hide it."""
     seen = [Sighting(s, *s.at(frequency_hz)) for s in searched]
-    seen = [s for s in seen if s.ratio >= 0]
+    return [s for s in seen if s.ratio >= 0]
+
+
+def present_in(seen: Sequence[Sighting]) -> list[Sighting]:
+    """The runs in which a tone is, if they are most of those that could show it; else none."""
     present = [s for s in seen if s.chance < PRESENT and s.where.purity(s.bin) > PURE_KNOWN]
-    if 2 * len(present) <= len(seen):
-        return []
-    enough = len(present) > 1 and len(seen) >= SEEN_SHARE * len(searched)
-    return present if enough or credible else []
+    return present if 2 * len(present) > len(seen) else []
 
 
 def common(
-    searched: Sequence[Lines], frequency_hz: float, present: Sequence[Sighting]
+    frequency_hz: float, seen: Sequence[Sighting], present: Sequence[Sighting]
 ) -> Tone | None:
     """The tone with its mean amplitude; None when noise could do it (Fisher's sum over runs)."""
-    seen = [Sighting(s, *s.at(frequency_hz)) for s in searched]
-    chance = np.array([s.chance for s in seen if s.ratio >= 0])
+    chance = np.array([s.chance for s in seen])
     statistic = -2 * float(np.sum(np.log(np.maximum(chance, 1e-300))))
-    bins = max(s.ratio.size for s in searched)
+    bins = max(s.where.ratio.size for s in seen)
     p_value = min(1.0, bins * chi2_tail(statistic, 2 * chance.size))
     if p_value > ALPHA:
         return None
     amplitude = np.array([velocity(s) for s in present])
     noise = amplitude / np.sqrt([max(s.ratio, 1.0) for s in present])
     # seen in one run, it may be another in the next one
-    spread = (
-        float(np.std(amplitude, ddof=1)) / np.sqrt(amplitude.size)
-        if amplitude.size > 1
-        else float(amplitude[0]) / 2
-    )
+    spread = _of_mean(amplitude, alone=float(amplitude[0]) / 2)
     stderr = max(spread, float(np.sqrt(np.sum(noise**2)) / amplitude.size))
-    places = np.array([(s.bin + crest(s.view, s.bin)[0]) * s.view.bin_hz for s in present])
-    wander = float(np.std(places, ddof=1)) / np.sqrt(places.size) if places.size > 1 else 0.0
+    at = np.array([(s.bin + crest(s.view, s.bin)[0]) * s.view.bin_hz for s in present])
+    wander = _of_mean(at, alone=0.0)
     first = present[0].view
     placed = float(np.hypot(wander, CREST_BINS * first.bin_hz))
     unit = "m/s" if first.microphones is not None else first.run.signals[first.inputs[0]].unit
     names = tuple(s.view.name for s in present)
     amplitude_mean = float(np.mean(amplitude))
     return Tone(frequency_hz, placed, amplitude_mean, stderr, unit, names, p_value)
+
+
+def _of_mean(values: FloatArray, alone: float) -> float:
+    """Standard error of the values' mean, or `alone` where there is but one."""
+    if values.size == 1:
+        return alone
+    return float(np.std(values, ddof=1)) / float(np.sqrt(values.size))
 
 
 def velocity(sighting: Sighting) -> float:

@@ -35,6 +35,8 @@ from identify.trace.tried import (
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[float, str], None]
+#: A set of effects, those of them that are kept, the one that is not, what comes in its place.
+_Exchange = tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]
 
 UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
 RUNNERS_UP = 2  # sets whose other forms are tried for that
@@ -127,8 +129,7 @@ def in_each_form(
             and key_of_forms((*kept, form)) not in done
         ]
     items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
-    fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
-    return [tried(fit.structure.effects, fit, data) for fit in fits]
+    return _refitted(items, data, run)
 
 
 def suits(form: Effect, structure: Structure, beside: Sequence[Effect]) -> bool:
@@ -139,7 +140,12 @@ def suits(form: Effect, structure: Structure, beside: Sequence[Effect]) -> bool:
     return form.mode_count in (None, plain.mode_count, *fuller)
 
 
-def _in_form(item: tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]) -> Fit | None:
+def _refitted(items: Sequence[_Exchange], data: Dataset, run: Executor) -> list[Tried]:
+    fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
+    return [tried(fit.structure.effects, fit, data) for fit in fits]
+
+
+def _in_form(item: _Exchange) -> Fit | None:
     """`t` with one of its effects in another form, or another effect in its place, beside those
     kept; None where none starts."""
     t, kept, old, form, data = item
@@ -307,8 +313,7 @@ def at_the_same_place(
         and not e.refines
         and key_of_forms((*kept, e)) not in done
     ]
-    fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
-    return [tried(fit.structure.effects, fit, data) for fit in fits]
+    return _refitted(items, data, run)
 
 
 def in_their_places(

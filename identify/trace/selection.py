@@ -399,8 +399,8 @@ def try_scatters(
 ) -> list[Tried]:
     """Each kind of random difference from run to run on top of `structure`, but for those whose
     evidence (χ² + p ln n) is surely beyond `most`."""
-    least = most - base.theta.size * float(np.log(data.residuals))
-    spreads = run.map(_scattered, [(structure, data, base, s, least) for s in scatters])
+    left = most - base.theta.size * float(np.log(data.residuals))  # of χ² and penalty
+    spreads = run.map(_scattered, [(structure, data, base, s, left) for s in scatters])
     return [
         replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
         for s, spread in zip(scatters, spreads, strict=True)
