@@ -92,10 +92,10 @@ class Own(Effect):
             modes = d.modes({d.parameters[0].name: self._sizes(p, at, j)}, at, modes)
         return modes
 
-    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+    def generator(self, p: Values, at: Conditions) -> Any:
         out: Any = 1.0
         for j, d in enumerate(self.directions):
-            out = d.actuator({d.parameters[0].name: self._sizes(p, at, j)}, at, s) * out
+            out = d.generator({d.parameters[0].name: self._sizes(p, at, j)}, at) * out
         return out
 
 

@@ -42,6 +42,7 @@ SQUARED = " squared"
 TREND_P = 0.003  # a rank correlation less probable than this is a law, not chance
 ONE_RUN = 0.9  # share of all deviation that a single run may hold
 SMALLEST = 1e-8
+UNSEEN = 1e-13  # singular value, relative to the largest, of what the data say nothing of
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
 HOPELESS = 5.0  # χ² a residual beyond which further rounds, or less noise, mend nothing …
 FAR = 30.0  # … and at first, when σ is no more than a guess
@@ -184,12 +185,7 @@ def _alternate(
 
 def _fit(structure: Structure, led: Led, rows: Sequence[_Rows], sizes: FloatArray) -> Fit:
     """θ's fit under the widened covariances."""
-    factors = [np.linalg.cholesky(_spread(r, sizes)) for r in rows]
-    pairs = list(zip(factors, rows, strict=True))
-    residual = np.concatenate([np.linalg.solve(L, r.residual[..., None]).ravel() for L, r in pairs])
-    jacobian = np.concatenate(
-        [np.linalg.solve(L, r.jacobian).reshape(-1, led.theta.size) for L, r in pairs]
-    )
+    residual, jacobian = _whitened(rows, sizes)
     return Fit(
         structure,
         led.theta,
@@ -272,21 +268,24 @@ def _widen(rows: _Rows, sizes: FloatArray) -> Batch:
 
 def _deviance(rows: Sequence[_Rows], sizes: FloatArray) -> float:
     """−2 ln of the restricted likelihood, up to a constant."""
-    p = rows[0].jacobian.shape[-1]
-    total = _penalty(rows, sizes)
-    A, pull = np.zeros((p, p)), np.zeros(p)
+    residual, jacobian = _whitened(rows, sizes)
+    scale = 1 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
+    left, values, _ = np.linalg.svd(jacobian * scale, full_matrices=False)
+    kept = values > UNSEEN * values[0]
+    logdet = 2 * float(np.sum(np.log(values[kept])) - np.sum(np.log(scale)))
+    absorbed = left[:, kept].T @ residual
+    return _penalty(rows, sizes) + float(residual @ residual - absorbed @ absorbed) + logdet
+
+
+def _whitened(rows: Sequence[_Rows], sizes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals e (n,) and Jacobian (n, p) of all runs, whitened by noise and spread."""
+    inner = []
     for r in rows:
         both = np.concatenate([r.residual[..., None], r.jacobian], axis=2)
-        inner = np.linalg.solve(_spread(r, sizes), both)
-        total += float(np.sum(r.residual * inner[..., 0]))
-        A += np.einsum("rni,rnj->ij", r.jacobian, inner[..., 1:])
-        pull += np.einsum("rni,rn->i", r.jacobian, inner[..., 0])
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(A), 1e-300))
-    values, vectors = np.linalg.eigh(A * scale[:, None] * scale)
-    kept = values > 1e-12 * values[-1]
-    seen = (vectors.T @ (scale * pull))[kept]
-    logdet = float(np.sum(np.log(values[kept])) - 2 * np.sum(np.log(scale)))
-    return total - float(np.sum(seen**2 / values[kept])) + logdet
+        solved = np.linalg.solve(np.linalg.cholesky(_spread(r, sizes)), both)
+        inner.append(solved.reshape(-1, both.shape[2]))
+    whole = np.concatenate(inner)
+    return whole[:, 0], whole[:, 1:]
 
 
 def _weighted(rows: _Rows, sizes: FloatArray) -> FloatArray:
@@ -346,7 +345,8 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> st
                 return f"{name} follows the {word}: no chance"
     if not there.size:
         return ""
-    residual, jacobian, deviations = _whitened(rows, sizes, there)
+    residual, jacobian = _whitened(rows, sizes)
+    deviations = _forced_tangents(rows, sizes, there)
     if scatter.location == "experiment":  # what wanders follows by chance what goes with the time
         trends = np.stack([known["time"], known["time" + SQUARED]], axis=1)
         slow = np.einsum("nmq,mk->nqk", deviations, trends).reshape(residual.size, -1)
@@ -383,20 +383,17 @@ def _conditions(
     return known, ranked, laws
 
 
-def _whitened(
-    rows: Sequence[_Rows], sizes: FloatArray, there: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Residuals (n,) and Jacobian (n, p), whitened by noise and spread, and the forced runs'
-    tangents (n, runs, directions) `there`."""
-    residual, jacobian, tangent = [], [], []
+def _forced_tangents(rows: Sequence[_Rows], sizes: FloatArray, there: IntArray) -> FloatArray:
+    """The forced runs' tangents (n, runs, directions) `there`, n counting all runs' residuals,
+    whitened by noise and spread."""
+    tangent = []
     for r in rows:
         L = np.linalg.cholesky(_spread(r, sizes))
-        residual += list(np.linalg.solve(L, r.residual[..., None])[..., 0])
-        jacobian += list(np.linalg.solve(L, r.jacobian))
         tangent += [(t, r.batch.free) for t in np.linalg.solve(L, r.tangent[..., there])]
-    ends = np.cumsum([e.size for e in residual])
+    ends = np.cumsum([len(t) for t, _ in tangent])
     forced = [i for i, (_, free) in enumerate(tangent) if not free]
-    deviations = np.zeros((int(ends[-1]), len(forced), there.size))
+    out = np.zeros((int(ends[-1]), len(forced), there.size))
     for column, i in enumerate(forced):
-        deviations[ends[i] - residual[i].size : ends[i], column] = tangent[i][0]
-    return np.concatenate(residual), np.concatenate(jacobian), deviations
+        own, _ = tangent[i]
+        out[ends[i] - len(own) : ends[i], column] = own
+    return out

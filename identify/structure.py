@@ -235,6 +235,10 @@ class Effect:
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch | None:
         return None
 
+    def generator(self, p: Values, at: Conditions) -> Any:
+        """A factor on the recorded drive's harmonics, ahead of the amplifier."""
+        return 1.0
+
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
         return u
 
@@ -360,12 +364,14 @@ class Structure:
         resonators = [resonance(m, s) for m in modes]
         H = self.flame_path(p, at, s)
         drive: Any = at.drive
+        for d in at.deviations:
+            drive = d.effect.generator(d.values, at) * drive
+        for e in self.effects:
+            drive = e.generator(p, at) * drive
         for e in self.effects:
             drive = e.drive(p, at, drive)
         for e in self.effects:
             drive = e.actuator(p, at, s) * drive
-        for d in at.deviations:
-            drive = d.effect.actuator(d.values, at, s) * drive
         on = at.flame_on[:, None]
         by_flame = [m.flame_residue for m in modes]
         by_drive = [m.speaker_residue for m in modes]

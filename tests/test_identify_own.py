@@ -6,13 +6,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from daq.importers import open_campaign
 from identify import assess, start
 from identify.effects.scatter import SCATTERS, DrivePhase, Scatter
+from identify.identification import prepare
+from identify.load import load_campaign
 from identify.own import Own, settle
 from identify.scatter import fit_scatter
 from simulated_rig import build_config
+from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.config import Drift
 from simulated_rig.drift import change_at
+from simulated_rig.effects import make_effect
+from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.trace_material import thesis_campaign
 
 SEED = 5
@@ -35,7 +41,9 @@ def test_placed_deviations_and_unknown_ones_are_the_same(tmp_path: Path) -> None
     )
     placed = own.placed(batch, z)
     known = assess.predict(ready.structure, fit.theta, placed)
-    np.testing.assert_allclose(known.orbits.velocity, unknown.orbits.velocity, rtol=1e-9)
+    np.testing.assert_allclose(
+        known.orbits.velocity, unknown.orbits.velocity, rtol=1e-9, atol=1e-15
+    )
     away = np.abs(known.residual - assess.predict(ready.structure, fit.theta, batch).residual)
     assert away.max() > 1.0
     gain, phase = placed.at.deviations
@@ -92,6 +100,27 @@ def test_a_drive_that_scatters_by_five_per_cent(tmp_path: Path) -> None:
     assert assess.lack_of_fit_p(spread.fit.chi2, spread.fit.dof) > 1e-3
     gain = spread.sizes["drive_scatter.gain_rms"]
     assert abs(np.log(gain.value / 0.05)) < 3 * gain.stderr / gain.value
+
+
+def test_a_spread_is_known_no_better_than_so_few_runs_tell(tmp_path: Path) -> None:
+    """A thousand times the noise: θ knows some directions a million times better than others, and
+    what they absorb of the deviations must not be lost among the digits."""
+    size = 0.00257
+    rig = random_rig(6013, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    scatter = make_effect("drive_scatter", {"gain_rms": size, "phase_rms_rad": size})
+    rig, plan = random_campaign(6013, rig, [scatter], forced=9, validation=3)
+    write_campaign(simulate_campaign(rig, plan, 6013, declared_modes=1), tmp_path)
+    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    base = start.fit_from_data(ready.structure, ready.data)
+    spread = fit_scatter(ready.structure, ready.data, base, named("drive_scatter"))
+    assert spread is not None
+    wide = spread.data.validation
+    held_out = [assess.predict(spread.fit.structure, spread.fit.theta, b) for b in wide]
+    assert assess.validation_p(held_out, spread.fit.covariance) > 1e-3
+    for known in spread.sizes.values():
+        error = known.stderr / known.value
+        assert 0.15 < error < 0.5  # of n deviations it is 1/√(2n)
+        assert abs(np.log(known.value / size)) < 3 * error
 
 
 @pytest.mark.parametrize(

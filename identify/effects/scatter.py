@@ -8,6 +8,8 @@ Deviations along a direction add up: twice 0.1 is 0.2, so that a ratio is named 
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from identify import dual
 from identify.effects.experiment import changed
 from identify.parameters import Parameter
@@ -15,7 +17,7 @@ from identify.structure import Conditions, Effect, Mode, Values
 
 
 class Direction(Effect):
-    """An effect of one parameter, through its hooks `modes` and `actuator` alone."""
+    """An effect of one parameter, through its hooks `modes` and `generator` alone."""
 
     common = True  # whether the declared model absorbs what all runs deviate by together
 
@@ -45,7 +47,7 @@ class Scatter(Effect):
 
 
 class Change(Direction):
-    """A change of frequency, flame or speaker gain, as the logarithm of its ratio."""
+    """A change of frequency or flame gain, as the logarithm of its ratio."""
 
     location = "experiment"
 
@@ -57,15 +59,26 @@ class Change(Direction):
         return changed(modes, self.what, dual.exp(p[self.parameters[0].name]))
 
 
+class DriveGain(Direction):
+    """The amplifier is given more than the recorded drive: the logarithm of their ratio."""
+
+    name, location = "drive_gain", "actuator"
+    parameters = (Parameter("drive_gain.log_ratio", "1", scale=1e-2),)
+
+    def generator(self, p: Values, at: Conditions) -> Any:
+        return dual.exp(p["drive_gain.log_ratio"])
+
+
 class DrivePhase(Direction):
-    """The sound lags the recorded drive by a phase."""
+    """The amplifier is given what lags the recorded drive, by this phase of the fundamental."""
 
     name, location = "drive_phase", "actuator"
     parameters = (Parameter("drive_phase.shift", "rad", scale=1e-2),)
     common = False
 
-    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
-        return dual.exp(p["drive_phase.shift"] * -1j)
+    def generator(self, p: Values, at: Conditions) -> Any:
+        orders = np.arange(1, at.harmonics + 1)
+        return dual.exp(p["drive_phase.shift"] * (-1j * orders))
 
 
 SCATTERS: tuple[Scatter, ...] = (
@@ -73,7 +86,7 @@ SCATTERS: tuple[Scatter, ...] = (
         "drive_scatter",
         "actuator",
         "",
-        (("gain_rms", "1", Change("speaker_gain", 1e-2)), ("phase_rms_rad", "rad", DrivePhase())),
+        (("gain_rms", "1", DriveGain()), ("phase_rms_rad", "rad", DrivePhase())),
     ),
     Scatter(
         "flame_gain_modulation", "flame", "", (("modulation_rms", "1", Change("flame_gain", 1e-2)),)
