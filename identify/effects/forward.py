@@ -111,7 +111,8 @@ class SideResonator(Effect):
     """A resonator beside the tube, a Helmholtz resonator or a plenum, coupled to `modes` modes.
 
     y'' + 2ζω y' + ω² y = ω² Σ q_i η_i, with the displacements η_i at its mouth, and it pushes back
-    on mode i by −κ_i y''. So κ_i ω² s/(s² + 2ζωs + ω²) loads the velocity there; q_1 = 1.
+    on mode i by −κ_i y''. So κ_i ω² s/(s² + 2ζωs + ω²) loads the velocity there; q_1 = 1, so that
+    near a node of mode 1 the others have no bound.
     Other than one more mode, it moves the poles of the others, and its residues have phases.
     """
 
@@ -125,7 +126,7 @@ class SideResonator(Effect):
             Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
             Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
             *(Parameter(f"acoustic_mode.coupling{i}", "1", -1.0, 1.0, scale=1e-3) for i in each),
-            *(Parameter(f"acoustic_mode.mouth_ratio{i}", "1", -20.0, 20.0) for i in each[1:]),
+            *(Parameter(f"acoustic_mode.mouth_ratio{i}", "1") for i in each[1:]),
         )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
