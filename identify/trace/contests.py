@@ -27,6 +27,7 @@ from identify.trace.tried import (
     Tried,
     best_by_name,
     best_form,
+    best_of_each_form,
     key_of_forms,
     misfit,
     tried,
@@ -361,10 +362,7 @@ def led_on(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
     a long way from the declared fit, whatever its direction."""
     if any(t.explains for t in tries):
         return []
-    best: dict[tuple[str, ...], Tried] = {}
-    for t in sorted(tries, key=misfit):
-        best.setdefault(t.key_of_forms, t)
-    far = [t for t in list(best.values())[:LED_ON] if not t.fit.converged]
+    far = [t for t in best_of_each_form(tries)[:LED_ON] if not t.fit.converged]
     return _where_better(far, run.map(_further, [(t, data) for t in far]), data)
 
 
@@ -382,7 +380,8 @@ def _further(item: tuple[Tried, Dataset]) -> Fit:
 def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
     """What had not converged and might yet be a rival of the best, led to the end.
 
-    Weak effects leave long flat valleys: a rival must not be ruled out for want of iterations.
+    Weak effects leave long flat valleys: a rival must not be ruled out for want of iterations. Each
+    form for itself: which of an effect's forms comes nearest before the end says little.
     """
     good = [t for t in tries if t.explains]
     if not good:
@@ -390,7 +389,7 @@ def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]
     least = best_form(good).evidence + UNSETTLED
     near = [
         t
-        for t in best_by_name([t for t in tries if t.spread is None])
+        for t in best_of_each_form([t for t in tries if t.spread is None])
         if not t.fit.converged and t.evidence < least
     ]
     return _where_better(near, run.map(_to_the_end, [(t, data) for t in near]), data)

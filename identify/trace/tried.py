@@ -126,6 +126,14 @@ def best_by_name(tries: Sequence[Tried]) -> list[Tried]:
     return sorted(best.values(), key=misfit)
 
 
+def best_of_each_form(tries: Sequence[Tried]) -> list[Tried]:
+    """The best of each set of effects in their forms, best first."""
+    best: dict[tuple[str, ...], Tried] = {}
+    for t in sorted(tries, key=misfit):
+        best.setdefault(t.key_of_forms, t)
+    return list(best.values())
+
+
 def misfit(t: Tried) -> float:
     return t.fit.chi2
 
