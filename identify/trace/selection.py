@@ -9,8 +9,9 @@ from identify.dataset import Dataset
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, InProcess
-from identify.fit import Fit, fit_orbits
+from identify.fit import Fit, fit_orbits, soften
 from identify.scatter import Spread, fit_scatter
+from identify.start import fit_from_data
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
     at_the_same_place,
@@ -44,6 +45,8 @@ from identify.trace.tried import (
 Progress = Callable[[float, str], None]
 
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
+SOFTENED = (0.005, 0.02)  # shares of each coefficient that count as noise, to see what is greatest
+FOREMOST = 2  # laws seen there beside which chance is tried
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that grown pairs leave, beyond which all pairs are sought from afar
 STANDS_OUT = 30.0  # times less misfit than with any other effect
@@ -231,6 +234,30 @@ class _Searching:
             alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
             found = _beside_chance(alone, self.data, self.apart, self.run)
             self.tried += [*found, *_without_chance(found, self.data)]
+        for share in SOFTENED:
+            if not self.explained:
+                self._from_softened(share)
+
+    def _from_softened(self, share: float) -> None:
+        """An effect and chance that are both gross lead each other astray. Where noise of such a
+        `share` of every coefficient hides the lesser of them, the greater is found by itself."""
+        self.report(0.6, f"looking at the data to within {share:.1%}")
+        data, run = self.data, self.run
+        soft = replace(data, fit=soften(data.fit, share))
+        base = fit_from_data(self.structure, soft)
+        if not np.isfinite(base.chi2):
+            return
+        laws = try_effects(
+            self.structure, soft, base, self.apart, executor=run, keep=5,
+            far=base.chi2_per_dof > GROSS, progress=lambda share, text: None,
+        )  # fmt: skip
+        found = []
+        for t in best_by_name(laws)[:FOREMOST]:
+            found += self._scattered(t.fit.structure, t.fit)
+        spreads = try_scatters(self.structure, soft, base, self.scatters, run)
+        found += _beside_chance(spreads, data, self.apart, run)
+        found += _simpler_beside_chance(found, data, self.apart, run)
+        self.tried += [*found, *_without_chance(found, data)]
 
     def _scattered(self, structure: Structure, base: Fit) -> list[Tried]:
         """Run-to-run scatter on top of `structure`; beside what explains the data already, as far
