@@ -48,7 +48,7 @@ BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 SOFTENED = (0.005, 0.02)  # shares of each coefficient that count as noise, to see what is greatest
 FOREMOST = 2  # laws seen there beside which chance is tried
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
-MUCH = 30.0  # χ²/dof that grown pairs leave, beyond which all pairs are sought from afar
+MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought, and chance, from afar
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
@@ -235,7 +235,7 @@ class _Searching:
             found = _beside_chance(alone, self.data, self.apart, self.run)
             self.tried += [*found, *_without_chance(found, self.data)]
         for share in SOFTENED:
-            if not self.explained:
+            if not self.explained and _least(self.tried) > MUCH:
                 self._from_softened(share)
 
     def _from_softened(self, share: float) -> None:
