@@ -10,9 +10,10 @@ are small, and the workers of `pytest -n` would fight over the cores.
 
 import ctypes.util
 import importlib.util
+import logging
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -74,3 +75,15 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         pytest.skip(missing)
     if item.get_closest_marker("shared") is not None and not SHARED.is_dir():
         pytest.skip(f"recorded material not found: {SHARED}")
+
+
+@pytest.fixture(autouse=True)
+def _own_logs() -> Iterator[None]:
+    """What a command sends to its standard error ends with the test that has taken that over."""
+    loggers = [logging.getLogger(name) for name in ("entrain", "uvicorn")]
+    before = [(x, x.handlers[:], x.level, x.propagate) for x in loggers]
+    yield
+    for logger, handlers, level, propagate in before:
+        logger.handlers = handlers
+        logger.setLevel(level)
+        logger.propagate = propagate

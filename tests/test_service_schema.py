@@ -161,6 +161,6 @@ def test_nothing_secret_in_logs(
         logger.removeHandler(caplog.handler)
     text = caplog.text
     assert "/api/v1/rigs 200" in text
-    for secret in (keys["read"], keys["read"].split("_")[2], ticket, "hunter2"):
+    for secret in (keys["read"], keys["read"].split("_", 2)[2], ticket, "hunter2"):
         assert secret not in text
     assert "\nforged" not in text

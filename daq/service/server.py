@@ -64,6 +64,8 @@ def make_server(settings: Settings) -> Server:
         timeout_graceful_shutdown=max(1, round(settings.server.shutdown_s)),
         h11_max_incomplete_event_size=65_536,
     )
+    # nor by whoever listens to all loggers: its lines have the queries, and tickets in them
+    logging.getLogger("uvicorn.access").disabled = True
     return Server(config, service)
 
 
