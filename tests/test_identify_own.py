@@ -8,11 +8,14 @@ import pytest
 
 from daq.importers import open_campaign
 from identify import assess, start
+from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS, DrivePhase, Scatter
 from identify.identification import prepare
 from identify.load import load_campaign
 from identify.own import Own, settle
 from identify.scatter import fit_scatter
+from identify.structure import Effect
+from identify.trace.stages import known_sizes
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.config import Drift
@@ -50,6 +53,28 @@ def test_placed_deviations_and_unknown_ones_are_the_same(tmp_path: Path) -> None
     assert abs(gain.size.sum()) < 1e-12  # the speaker's gain is the declared model's own
     assert isinstance(phase.effect, DrivePhase)
     assert abs(phase.size.sum()) > 1e-3
+
+
+@pytest.mark.parametrize("key", [e.key for e in CATALOGUE if type(e).drive is not Effect.drive])
+def test_what_a_drive_deviates_by_goes_through_the_amplifier(tmp_path: Path, key: str) -> None:
+    """Unknown deviations of the drive beside each distortion: derivatives as by differences."""
+    ready = thesis_campaign(tmp_path, SEED, {})
+    fit = start.fit_from_data(ready.structure, ready.data)
+    batch, effect = ready.data.fit[0], by_key(key)
+    row = effect.starts(known_sizes(ready.data, fit))[0]
+    own = Own(named("drive_scatter").directions, batch.at.identity)
+    larger = ready.structure.with_effects(effect, own)
+    z = np.random.default_rng(1).normal(size=len(own.parameters))
+    theta = np.concatenate([fit.theta, effect.to_internal(row), z])
+    found = assess.predict(larger, theta, batch)
+    for i in (theta.size - z.size, theta.size - 1):  # of the gain, of the phase
+        step = np.zeros(theta.size)
+        step[i] = 1e-4
+        after, before = (assess.predict(larger, theta + x, batch).residual for x in (step, -step))
+        slope = (after - before) / 2e-4
+        np.testing.assert_allclose(
+            found.jacobian[..., i].ravel(), slope.ravel(), atol=2e-4 * np.abs(slope).max()
+        )
 
 
 def test_runs_that_no_drive_reaches_are_left_alone(tmp_path: Path) -> None:

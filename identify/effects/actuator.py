@@ -1,18 +1,19 @@
 """Actuator: what stands between the recorded drive and the sound at the speaker."""
 
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from identify import balance, dual
+from identify.dual import Dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Values
 
-ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
+
+FINE = 2048  # samples a period: corners alias below 1e-6
 
 
 class SpeakerResonance(Effect):
@@ -171,13 +172,16 @@ class HardClipping(Effect):
         return [(share * known.drive_amplitude,) for share in (0.25, 0.5, 0.7, 0.85, 0.96)]
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        forth, back = _finely(at.harmonics)
-        level = p["actuator_nonlinearity.level_v"]
-        wave = np.concatenate([u.real, u.imag], axis=1) @ forth
-        cut = np.clip(wave, -dual.value(level), dual.value(level))
+        K, level = at.harmonics, p["actuator_nonlinearity.level_v"]
+        wave = balance.to_time(u, K, FINE)
+        v = dual.value(wave)
+        cut = np.clip(v, -dual.value(level), dual.value(level))
         # only the cut samples depend on the level; their harmonics are its derivative
-        moved = np.sign(wave) * (np.abs(wave) > dual.value(level))
-        return dual.chain(cut @ back, (moved @ back, level))
+        moved = np.sign(v) * (np.abs(v) > dual.value(level))
+        harmonics = [balance.to_harmonics(x, K, FINE) for x in (cut, moved)]
+        return dual.chain(harmonics[0], (harmonics[1], level)) + _carried(
+            wave, 1 - np.abs(moved), K
+        )
 
 
 class Crossover(Effect):
@@ -210,26 +214,29 @@ class Knee(Effect):
         return [(share * u, n) for share in (0.35, 0.6, 0.9) for n in (3.0, 8.0)]
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        forth, back = _finely(at.harmonics)
+        K = at.harmonics
         L, n = p["actuator_nonlinearity.level_v"], p["actuator_nonlinearity.order"]
         level, order = dual.value(L), dual.value(n)
-        wave = np.concatenate([u.real, u.imag], axis=1) @ forth
-        ratio = np.maximum(np.abs(wave) / level, 1e-12)
+        wave = balance.to_time(u, K, FINE)
+        v = dual.value(wave)
+        ratio = np.maximum(np.abs(v) / level, 1e-12)
         power = ratio**order
         q = 1.0 + power
-        out = wave * q ** (-1.0 / order)
+        gain = q ** (-1.0 / order)
+        out = v * gain
         by_level = out * power / q / level
         by_order = out * (np.log(q) / order**2 - power * np.log(ratio) / (order * q))
-        return dual.chain(out @ back, (by_level @ back, L), (by_order @ back, n))
+        harmonics = [balance.to_harmonics(x, K, FINE) for x in (out, by_level, by_order)]
+        own = dual.chain(harmonics[0], (harmonics[1], L), (harmonics[2], n))
+        return own + _carried(wave, gain / q, K)
 
 
-@lru_cache(maxsize=8)
-def _finely(harmonics: int) -> tuple[FloatArray, ComplexArray]:
-    """Matrices (2K, T) to and (T, K) from 2048 samples a period: corners alias below 1e-6."""
-    tau = 2 * np.pi * np.arange(2048) / 2048
-    angle = np.outer(np.arange(1, harmonics + 1), tau)
-    forth = np.vstack([np.cos(angle), -np.sin(angle)])
-    return forth, np.asarray((2.0 / tau.size) * np.exp(-1j * angle.T))
+def _carried(wave: Any, slope: FloatArray, harmonics: int) -> Any:
+    """What becomes of a wave's own derivatives behind a curve of that slope; 0 of a plain one."""
+    if not isinstance(wave, Dual):
+        return 0.0
+    moved = Dual(np.zeros_like(wave.v), wave.d * slope[..., None])
+    return balance.to_harmonics(moved, harmonics, FINE)
 
 
 EFFECTS: tuple[Effect, ...] = (
