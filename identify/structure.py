@@ -3,7 +3,7 @@
     velocity      Y = Σ_i b_i(s) [ r_i s F + a_i U' − L_i ],   b_i(s) = s / (s² + 2ζ_i ω_i s + ω_i²)
     flame input   w = H(s) Y,       first order: H = 1 / (s + ω_f)          (Eq. 4.12)
     flame output  F = N(w) = w + c2 w² + c3 w³ + …             slope one: the gain sits in r_i
-    drive         U' = A(s) · g(U)
+    drive         U' = A(s) · g(γ U)              γ_k: what the amplifier is given of the recorded U
     measurement   M = sensor(Y)
 
 `r_i` = k_f · 22.5 · ψ_i(xf) D_i and `a_i` = ψ_i(xa) D_i in the thesis's terms: only these products
@@ -363,11 +363,12 @@ class Structure:
         modes = self._modes(p, at)
         resonators = [resonance(m, s) for m in modes]
         H = self.flame_path(p, at, s)
-        drive: Any = at.drive
+        given: Any = 1.0
         for d in at.deviations:
-            drive = d.effect.generator(d.values, at) * drive
+            given = d.effect.generator(d.values, at) * given
         for e in self.effects:
-            drive = e.generator(p, at) * drive
+            given = e.generator(p, at) * given
+        drive = given * at.drive
         for e in self.effects:
             drive = e.drive(p, at, drive)
         for e in self.effects:

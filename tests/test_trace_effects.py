@@ -8,15 +8,13 @@ import numpy.typing as npt
 import pytest
 
 import identify
-from daq.importers import open_campaign
 from identify import assess, balance, diagnosis, start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import Fit, fit_orbits
-from identify.identification import Prepared, prepare
-from identify.load import load_campaign
+from identify.identification import Prepared
 from identify.parameters import Estimate
 from identify.report.gallery import save_figures
 from identify.results import PLACES
@@ -29,13 +27,13 @@ from identify.trace.selection import against_chance, try_scatters
 from identify.trace.stages import known_sizes
 from identify.trace.tried import tried
 from simulated_rig import build_config
-from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.effects import EFFECTS, make_effect
-from simulated_rig.random_rigs import random_campaign, random_rig
+from simulated_rig.random_rigs import random_rig
 from tests.trace_material import (
     campaign,
     fitted,
     only,
+    record,
     recorded,
     search_for,
     thesis_campaign,
@@ -255,9 +253,7 @@ def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
         make_effect("parameter_drift/flame_gain", {"flame_gain_change": 0.004}),
         make_effect("flame_dynamics/distributed_delay", {"mean_delay_s": 8e-5}),
     ]
-    rig, plan = random_campaign(15, rig, effects, forced=6, validation=2)
-    write_campaign(simulate_campaign(rig, plan, 15, declared_modes=2), tmp_path)
-    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    ready = record(tmp_path, 15, rig, effects, forced=6, validation=2)
     keys = ("flame_delay", "flame_dynamics:second_time_scale", "parameter_drift:flame_gain")
     base = start.fit_from_data(ready.structure, ready.data)
     found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
@@ -269,15 +265,14 @@ def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
 def test_what_stands_out_and_does_not_explain_keeps_none_from_a_start_afar(tmp_path: Path) -> None:
     """A voice coil's lag of 0.08 rad, noise of 2e-6: near the declared fit a further mode takes
     away nearly all that the other effects leave, and is wrong."""
-    rig, plan = random_campaign(
+    ready = record(
+        tmp_path,
         120,
         random_rig(120, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3)),
         [make_effect("actuator_dynamics/voice_coil", {"pole_hz": 1828.27})],
         forced=10,
         validation=3,
     )
-    write_campaign(simulate_campaign(rig, plan, 120, declared_modes=2), tmp_path)
-    ready = prepare(load_campaign(open_campaign(tmp_path)))
     base = start.fit_from_data(ready.structure, ready.data)
     others = ("flame_dynamics:pole", "nonlinearity_shape:quintic", "channel_mismatch:skew")
     keys = ("acoustic_mode", "actuator_dynamics:pole", "parameter_drift:damping", *others)
@@ -292,15 +287,14 @@ def test_what_stands_out_and_does_not_explain_keeps_none_from_a_start_afar(tmp_p
 def test_the_other_forms_of_the_nearest_effect_are_tried(tmp_path: Path) -> None:
     """A speaker that resonates at 160 Hz: by its acceleration, refitted first, it is not explained,
     and was with a further mode beside it."""
-    rig, plan = random_campaign(
+    ready = record(
+        tmp_path,
         11,
         random_rig(11, noise_db=70.0, modes=(2,)),
         [make_effect("actuator_dynamics/resonance", {"resonance_hz": 160.0, "damping": 0.47})],
         forced=8,
         validation=2,
     )
-    write_campaign(simulate_campaign(rig, plan, 11, declared_modes=2), tmp_path)
-    ready = prepare(load_campaign(open_campaign(tmp_path)))
     keys = ("actuator_dynamics:acceleration", "actuator_dynamics:resonance", "acoustic_mode")
     best, rivals = search_for(ready, *keys)
     assert [e.key for e in best.effects] == ["actuator_dynamics:resonance"]
@@ -615,9 +609,7 @@ def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
         make_effect("drive_scatter", {"gain_rms": 0.0026, "phase_rms_rad": 0.0026}),
     ]
     rig = random_rig(6013, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
-    rig, plan = random_campaign(6013, rig, effects, forced=9, validation=3)
-    write_campaign(simulate_campaign(rig, plan, 6013, declared_modes=1), tmp_path)
-    ready = prepare(load_campaign(open_campaign(tmp_path)))
+    ready = record(tmp_path, 6013, rig, effects, forced=9, validation=3, modes=1)
     base = start.fit_from_data(ready.structure, ready.data)
     assert base.chi2_per_dof > 1e4
     laws = ("quadratic", "cubic_quintic")

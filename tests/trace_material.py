@@ -17,8 +17,10 @@ from identify.record import Campaign
 from identify.structure import Structure
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
+from simulated_rig.config import RigConfig
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
+from simulated_rig.seal import SealedEffect
 
 
 def campaign(
@@ -53,6 +55,22 @@ def only(ready: Prepared, base: Fit, key: str) -> trace.Tried:
     return trace.started_again(found, ready.data, InProcess())[0]
 
 
+def record(
+    folder: Path,
+    seed: int,
+    rig: RigConfig,
+    effects: Sequence[SealedEffect],
+    *,
+    forced: int,
+    validation: int,
+    modes: int = 2,
+) -> Prepared:
+    """A random campaign on a rig with these effects, so many modes declared, written and read."""
+    rig, plan = random_campaign(seed, rig, effects, forced=forced, validation=validation)
+    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=modes), folder)
+    return prepare(load_campaign(open_campaign(folder)))
+
+
 def thesis_campaign(
     folder: Path,
     seed: int,
@@ -65,9 +83,7 @@ def thesis_campaign(
     pairs = effects.items() if isinstance(effects, Mapping) else effects
     made = [make_effect(key, parameters) for key, parameters in pairs]
     rig = build_config(preset, noise_db=noise_db)
-    rig, plan = random_campaign(seed, rig, made, forced=7, validation=validation)
-    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=2), folder)
-    return prepare(load_campaign(open_campaign(folder)))
+    return record(folder, seed, rig, made, forced=7, validation=validation)
 
 
 def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tried]]:

@@ -64,7 +64,7 @@ def make_server(settings: Settings) -> Server:
         timeout_graceful_shutdown=max(1, round(settings.server.shutdown_s)),
         h11_max_incomplete_event_size=65_536,
     )
-    # nor by whoever listens to all loggers: its lines have the queries, and tickets in them
+    # `access_log` takes its handlers away; one who listens to all loggers must not hear it either
     logging.getLogger("uvicorn.access").disabled = True
     return Server(config, service)
 

@@ -178,10 +178,7 @@ class HardClipping(Effect):
         cut = np.clip(v, -dual.value(level), dual.value(level))
         # only the cut samples depend on the level; their harmonics are its derivative
         moved = np.sign(v) * (np.abs(v) > dual.value(level))
-        harmonics = [balance.to_harmonics(x, K, FINE) for x in (cut, moved)]
-        return dual.chain(harmonics[0], (harmonics[1], level)) + _carried(
-            wave, 1 - np.abs(moved), K
-        )
+        return _behind(wave, cut, 1 - np.abs(moved), K, (moved, level))
 
 
 class Crossover(Effect):
@@ -226,17 +223,21 @@ class Knee(Effect):
         out = v * gain
         by_level = out * power / q / level
         by_order = out * (np.log(q) / order**2 - power * np.log(ratio) / (order * q))
-        harmonics = [balance.to_harmonics(x, K, FINE) for x in (out, by_level, by_order)]
-        own = dual.chain(harmonics[0], (harmonics[1], L), (harmonics[2], n))
-        return own + _carried(wave, gain / q, K)
+        return _behind(wave, out, gain / q, K, (by_level, L), (by_order, n))
 
 
-def _carried(wave: Any, slope: FloatArray, harmonics: int) -> Any:
-    """What becomes of a wave's own derivatives behind a curve of that slope; 0 of a plain one."""
+def _behind(
+    wave: Any, out: FloatArray, slope: FloatArray, harmonics: int, *by: tuple[FloatArray, Any]
+) -> Any:
+    """Harmonics of what is `out` behind a curve of that `slope` at each sample of a wave, with its
+    derivatives `by` the curve's own parameters."""
+    # parameters vary all samples alike: their derivatives are taken to harmonics before the seeds
+    terms = [(balance.to_harmonics(partial, harmonics, FINE), x) for partial, x in by]
+    total = dual.chain(balance.to_harmonics(out, harmonics, FINE), *terms)
     if not isinstance(wave, Dual):
-        return 0.0
-    moved = Dual(np.zeros_like(wave.v), wave.d * slope[..., None])
-    return balance.to_harmonics(moved, harmonics, FINE)
+        return total
+    moved = Dual(np.zeros_like(out), wave.d * slope[..., None])
+    return total + balance.to_harmonics(moved, harmonics, FINE)
 
 
 EFFECTS: tuple[Effect, ...] = (

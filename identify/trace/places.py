@@ -21,7 +21,7 @@ from identify.structure import Structure
 from identify.trace.contests import part_of
 from identify.trace.selection import usable
 from identify.trace.stages import known_sizes, shares_of
-from identify.trace.tried import EVIDENCE, Tried, misfit
+from identify.trace.tried import EVIDENCE, Tried, first_of_each, misfit
 from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
@@ -79,9 +79,7 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
     """Where a misfit lies, from what the pieces (`shaped`) and single effects among `tries` leave
     of that of the fit `base`."""
     single = [t for t in tries if len(t.effects) == 1 and t.spread is None and t.plausible]
-    places: dict[str, Tried] = {}
-    for t in sorted([*pieces, *single], key=misfit):
-        places.setdefault(_place(t), t)
+    places = first_of_each(sorted([*pieces, *single], key=misfit), _place)
     left = {place: t.fit.chi2_per_dof for place, t in places.items()}
     likely = _likely(list(places.values()), base.chi2_per_dof)
     return Whereabouts(likely, left, base.chi2_per_dof)

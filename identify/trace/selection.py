@@ -37,6 +37,7 @@ from identify.trace.tried import (
     accounts,
     best_by_name,
     best_form,
+    first_of_each,
     foremost,
     misfit,
     tried,
@@ -249,7 +250,7 @@ class _Searching:
             return
         laws = try_effects(
             self.structure, soft, base, self.apart, executor=run, keep=5,
-            far=base.chi2_per_dof > GROSS, progress=lambda share, text: None,
+            far=base.chi2_per_dof > GROSS, progress=lambda done, text: None,
         )  # fmt: skip
         found = []
         for t in best_by_name(laws)[:FOREMOST]:
@@ -372,10 +373,8 @@ def _beside_chance(
         ranked = sorted(
             (e for e in available if e.key in scores), key=lambda e: -scores[e.key].drop
         )
-        first: dict[str, Effect] = {}  # the best form of each
-        for e in ranked:
-            first.setdefault(e.name, e)
-        for e in list(first.values())[:BESIDE]:
+        best = first_of_each(ranked, lambda e: e.name)  # the best form of each
+        for e in list(best.values())[:BESIDE]:
             theta = np.r_[base.theta, scores[e.key].size]
             larger = base.structure.with_effects(e)
             fit = fit_orbits(larger, wide, theta, continuation=(0.0,))

@@ -4,8 +4,9 @@ Selection is by lack of fit and held-out runs with corrected significance; infor
 only weigh candidates that are adequate already: χ² + p ln n, within 10 of the best.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,6 +20,9 @@ from identify.parameters import Estimate
 from identify.results import Candidate
 from identify.scatter import Spread
 from identify.structure import Effect
+
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 
 ALPHA = 1e-3  # false-alarm probability of each significance test
 GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
@@ -120,18 +124,21 @@ def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
 
 def best_by_name(tries: Sequence[Tried]) -> list[Tried]:
     """The best form of each set of effect names, best first."""
-    best: dict[tuple[str, ...], Tried] = {}
-    for t in sorted(tries, key=_merit):
-        best.setdefault(t.key, t)
+    best = first_of_each(sorted(tries, key=_merit), lambda t: t.key)
     return sorted(best.values(), key=misfit)
 
 
 def best_of_each_form(tries: Sequence[Tried]) -> list[Tried]:
     """The best of each set of effects in their forms, best first."""
-    best: dict[tuple[str, ...], Tried] = {}
-    for t in sorted(tries, key=misfit):
-        best.setdefault(t.key_of_forms, t)
-    return list(best.values())
+    return list(first_of_each(sorted(tries, key=misfit), lambda t: t.key_of_forms).values())
+
+
+def first_of_each(items: Iterable[T], kind: Callable[[T], K]) -> dict[K, T]:
+    """The first item of each kind, in their order."""
+    first: dict[K, T] = {}
+    for item in items:
+        first.setdefault(kind(item), item)
+    return first
 
 
 def misfit(t: Tried) -> float:
