@@ -34,6 +34,7 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
+HOPE = 20  # iterations for what may be given up as hopeless
 
 
 @dataclass(frozen=True)
@@ -360,6 +361,30 @@ class Descent:
         return float(self.residual @ self.residual)
 
 
+@dataclass(frozen=True)
+class _Factors:
+    """Scaled Jacobian J = U diag(sv) Vt at one place, without the unknowns `held` at a bound, and
+    what steps from there take of it."""
+
+    scale: FloatArray
+    jacobian: FloatArray
+    gradient: FloatArray
+    values: FloatArray
+    Vt: FloatArray
+    along: FloatArray  # Uᵀ ρ
+
+    @property
+    def promise(self) -> float:
+        """Decrease of χ² that a Gauss–Newton step would bring."""
+        return float(np.sum(self.along**2 * (self.values > 1e-9 * self.values[0])))
+
+    def step(self, damping: float) -> tuple[FloatArray, float]:
+        """The damped step in unscaled unknowns, and the decrease of χ² that it predicts."""
+        step = -(self.Vt.T @ (self.values / (self.values**2 + damping) * self.along))
+        slope = 2 * self.gradient + self.jacobian.T @ (self.jacobian @ step)
+        return step / self.scale, -float(step @ slope)
+
+
 @dataclass
 class _State:
     """One descent in progress."""
@@ -372,7 +397,7 @@ class _State:
     grow: float = 2.0
     refused: int = 0
     iterations: int = 0
-    promise: float = np.inf  # decrease of χ² that a Gauss–Newton step would bring
+    factors: "_Factors | None" = None
     ended: str | None = None
     converged: bool = False
 
@@ -389,6 +414,7 @@ def levenberg_marquardt(
     tolerance: float = 1e-6,
     damping: float = 1e-3,
     patience: int = 12,
+    hopeless: float = np.inf,
     bounds: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Descent | None]:
     """Minimise |ρ(θ)|² from each of `thetas`, (starts, p), side by side.
@@ -397,7 +423,8 @@ def levenberg_marquardt(
     step still to come would lower χ² by less than `tolerance` (absolute and relative): a hundredth
     of what a thousandth of a standard error is worth. Unknowns are scaled by the Jacobian's
     columns (Marquardt), damping follows the gain ratio (Nielsen); a descent ends after more than
-    `patience` refused steps in a row. Unknowns at a bound that the gradient pushes against are
+    `patience` refused steps in a row, or where after `HOPE` iterations |ρ|² is still beyond
+    `hopeless`. Unknowns at a bound that the gradient pushes against are
     held there; `bounds` are (p,) each, or (starts, p).
     """
     count, p = thetas.shape
@@ -417,6 +444,9 @@ def levenberg_marquardt(
         active = [(n, s) for n, s in enumerate(states) if s is not None and s.ended is None]
         trials, steps = [], []
         for n, s in active:
+            if s.iterations > HOPE and s.cost > hopeless:
+                s.ended = "given up far from any solution"
+                continue
             step = _propose(s, low[n], high[n], tolerance, iterations, patience)
             if step is not None:
                 trials.append((n, s))
@@ -469,6 +499,25 @@ def _propose(
     """The next trial of a descent and its predicted decrease, or None where it has ended."""
     if s.refused == 0:
         s.iterations += 1
+        s.factors = _factors(s, low, high)
+    assert s.factors is not None
+    promise = s.factors.promise
+    enough = 1.0 + 1e-3 * s.cost
+    if promise < tolerance * enough:
+        s.converged, s.ended = True, "converged"
+        return None
+    if s.refused > patience:
+        s.converged = promise < 1e-3 * enough
+        s.ended = "converged" if s.converged else "no step lowers the misfit any further"
+        return None
+    if s.iterations > iterations:
+        s.ended = f"not converged in {iterations} iterations"
+        return None
+    step, predicted = s.factors.step(s.damping)
+    return np.clip(s.theta + step, low, high), predicted
+
+
+def _factors(s: _State, low: FloatArray, high: FloatArray) -> _Factors:
     norm = np.sqrt(np.sum(s.jacobian * s.jacobian, axis=0))
     s.scale = np.maximum(s.scale, np.where(norm > 0, norm, 1e-100))
     scale = np.where(s.scale > 1e-100, s.scale, 1.0)
@@ -477,22 +526,7 @@ def _propose(
     held = ((s.theta <= low) & (g > 0)) | ((s.theta >= high) & (g < 0))
     J, g = np.where(held, 0.0, J), np.where(held, 0.0, g)
     U, sv, Vt = np.linalg.svd(J, full_matrices=False)
-    Ur = U.T @ s.residual
-    s.promise = float(np.sum(Ur**2 * (sv > 1e-9 * sv[0])))
-    enough = 1.0 + 1e-3 * s.cost
-    if s.promise < tolerance * enough:
-        s.converged, s.ended = True, "converged"
-        return None
-    if s.refused > patience:
-        s.converged = s.promise < 1e-3 * enough
-        s.ended = "converged" if s.converged else "no step lowers the misfit any further"
-        return None
-    if s.iterations > iterations:
-        s.ended = f"not converged in {iterations} iterations"
-        return None
-    step = -(Vt.T @ (sv / (sv**2 + s.damping) * Ur))
-    predicted = -float(step @ (2 * g + J.T @ (J @ step)))
-    return np.clip(s.theta + step / scale, low, high), predicted
+    return _Factors(scale, J, g, sv, Vt, U.T @ s.residual)
 
 
 def covariance_of(jacobian: FloatArray) -> FloatArray:

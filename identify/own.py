@@ -130,9 +130,11 @@ def lead(
     share: float = 0.0,
     steps: int | None = None,
     iterations: int = 150,
+    hopeless: float = np.inf,
 ) -> list[Led]:
     """Descents from `starts` (starts, p + own parameters) at noise raised by a `share` of each
-    coefficient's size, with orbits solved or approached by so many Newton `steps`; best first."""
+    coefficient's size, with orbits solved or approached by so many Newton `steps`; best first.
+    What stays beyond a misfit of `hopeless` is given up."""
     larger = structure.with_effects(own)
     balanced = [b.balanced(larger) for b in batches]
     residual = OrbitResidual(larger, soften(balanced, share), steps)
@@ -143,6 +145,7 @@ def lead(
         straight.inside(starts),
         iterations=iterations,
         tolerance=1e-6 if share == 0 else 1e-2,
+        hopeless=hopeless,
         bounds=straight.bounds(larger),
     )
     count = starts.shape[1] - len(own.parameters)

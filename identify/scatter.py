@@ -149,9 +149,12 @@ def _alternate(
     most: float,
 ) -> Spread | None:
     sizes, settled = _guess(own), False
+    if not len(starts):
+        return None
     for i in range(ROUNDS):
-        found = lead(structure, own, data.fit, starts, sizes) if len(starts) else []
-        if not found or found[0].cost > (FAR if i == 0 else HOPELESS) * data.residuals:
+        enough = (FAR if i == 0 else HOPELESS) * data.residuals
+        found = lead(structure, own, data.fit, starts, sizes, hopeless=10 * enough)
+        if not found or found[0].cost > enough:
             return None
         led = found[0]
         if led.cost > most + (WIDER**2 * len(own.parameters) if i == 0 else 0.0):
