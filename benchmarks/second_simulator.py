@@ -218,7 +218,10 @@ def record(tube: Tube, frequency_hz: float, volts: float, rng: np.random.Generat
 
 
 def write(tube: Tube, folder: Path, seed: int, title: str) -> None:
-    """A campaign folder: a free run, seven to fit on, three held out, recorded in any order."""
+    """A campaign folder: a free run, seven to fit on, three held out, recorded in any order.
+
+    Raises `OverflowError` where the oscillation grows without bound.
+    """
     rng = np.random.default_rng([seed, 5])
     (folder / "runs").mkdir(parents=True, exist_ok=True)
     text = HEAD.format(title=title)
@@ -232,6 +235,8 @@ def write(tube: Tube, folder: Path, seed: int, title: str) -> None:
     for i, ((frequency, volts, role), slot) in enumerate(zip(runs, slots, strict=True)):
         now = tube if tube.drift is None else tube.drift(tube, slot / (len(runs) - 1))
         signals = record(now, frequency, volts, rng) * np.array([0.002, 0.002, 1.0])
+        if not np.isfinite(signals).all():
+            raise OverflowError(f"{title}: run {i} grows without bound")
         counts = np.clip(np.round(signals / 10 * 2**15), -(2**15), 2**15 - 1)
         wavfile.write(folder / f"runs/{i:02d}.wav", RATE_HZ, counts.astype(np.int16))
         text += f'[[runs]]\nfile = "runs/{i:02d}.wav"\nstarted_s = {120 * slot}\n'
@@ -503,7 +508,11 @@ def main() -> None:
         for key, tube, seed in made:
             name = key.replace("/", "_") + (f"_{seed}" if options.drawn else "")
             folder = (options.out or Path(temporary)) / name
-            write(tube, folder, seed, key)
+            try:
+                write(tube, folder, seed, key)
+            except OverflowError as error:
+                print(error, flush=True)
+                continue
             recorded = load_campaign(open_campaign(folder))
             begin = time.monotonic()
             found = identify.diagnose(recorded, executor=run).to_json()
