@@ -10,7 +10,7 @@ from identify import balance
 from identify.dual import Dual
 from identify.effects import by_key
 from identify.polynomial import Polynomial
-from identify.structure import Characteristic, Conditions, Loop, Structure
+from identify.structure import Characteristic, Conditions, Loop, Structure, declared_modes
 from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
 
 K = 7
@@ -167,3 +167,15 @@ def test_a_polynomial_is_its_powers_and_knows_its_derivatives() -> None:
     np.testing.assert_allclose(n.table(2), [[0.2, 1.0, 0.5, -0.3, 0.0, 0.01]] * 2)
     seed = Dual(np.full((1, 1), -0.3), np.ones((1, 1, 1)))
     np.testing.assert_allclose(Polynomial((1.0, 0.0, seed))(w).d[..., 0], w**3)
+
+
+def test_a_mode_that_alone_is_damped_by_its_amplitude() -> None:
+    """Its loss is of its own velocity, and acts on no other mode."""
+    structure = Structure(3)
+    loss = by_key("nonlinear_damping:cubic_mode")
+    values = dict.fromkeys(structure.parameters.names, 1.0) | {"nonlinear_damping.coefficient": 2.0}
+    modes = declared_modes(values, 3)
+    found = loss.loss(values, None, modes)  # type: ignore[arg-type]
+    assert found is not None
+    assert found.coefficients == [2.0, 0.0, 0.0]
+    assert found.weights == [1.0, 0.0, 0.0]

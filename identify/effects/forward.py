@@ -168,9 +168,10 @@ class SideResonator(Effect):
 class NonlinearDamping(Effect):
     """Amplitude-dependent acoustic loss β |v|^(n−1) v, as by vortices shed at the open end.
 
-    ``quadratic`` and ``cubic`` act on the flame's velocity and on all modes alike; with ``_mode``
-    on the singing mode's part alone. With ``_end`` the velocity is that of another place, where the
-    modes meet in other proportions, v = Σ q_i y_i, and act back on mode i by g_i β: q_1 = g_1 = 1.
+    ``quadratic`` and ``cubic`` are of the flame's velocity and act on all modes alike; with
+    ``_mode`` of the singing mode's part, and on that mode alone: its damping grows. With ``_end``
+    the velocity is that of another place, where the modes meet in other proportions, v = Σ q_i y_i,
+    and act back on mode i by g_i β: q_1 = g_1 = 1.
     """
 
     name, location = "nonlinear_damping", "forward"
@@ -209,8 +210,10 @@ class NonlinearDamping(Effect):
             q: list[Any] = [1.0, *(p[n.name] for n in self.parameters[1::2]), *ones][:count]
             g: list[Any] = [1.0, *(p[n.name] for n in self.parameters[2::2]), *ones][:count]
             return Loss([beta * x for x in g], characteristic, q)
-        weights = [1.0] + [0.0 if self.mode_only else 1.0] * (count - 1)
-        return Loss([beta] * count, characteristic, weights)
+        if self.mode_only:
+            others = [0.0] * (count - 1)
+            return Loss([beta, *others], characteristic, [1.0, *others])
+        return Loss([beta] * count, characteristic, [1.0] * count)
 
 
 EFFECTS: tuple[Effect, ...] = (
