@@ -123,24 +123,30 @@ def _prediction_stderr(p: Prediction, covariance: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(both.sum(axis=1), 0.0)))
 
 
-def validation_p(predictions: Sequence[Prediction], covariance: FloatArray) -> float:
-    """Lack-of-fit p-value on runs never used, the parameters' own uncertainty included.
+def held_out_misfit(predictions: Sequence[Prediction], covariance: FloatArray) -> tuple[float, int]:
+    """χ² of runs never used, the parameters' own uncertainty included, and of how many residuals.
 
-    Cov(ρ) = I + J Σ Jᵀ for whitened residuals ρ of new runs.
+    Cov(ρ) = I + J Σ Jᵀ for whitened residuals ρ of new runs. With the χ² of the fitted runs it is
+    what a fit to all of them would leave (recursive least squares), to first order.
     """
     total, count = 0.0, 0
     for p in predictions:
-        n = p.residual.size
+        count += p.residual.size
         if not np.isfinite(p.residual).all():
-            return 0.0
+            return np.inf, count
         spread = p.jacobian @ np.nan_to_num(covariance, posinf=1e12) @ p.jacobian.T
         if not np.isfinite(spread).all():
-            return 0.0
+            return np.inf, count
         # by eigenvalues: where the data leave a parameter open, the spread is beyond rounding
         size, axes = np.linalg.eigh(0.5 * (spread + spread.T))
         total += float(np.sum((axes.T @ p.residual) ** 2 / (1.0 + np.maximum(size, 0.0))))
-        count += n
-    return lack_of_fit_p(total, count) if count else float("nan")
+    return total, count
+
+
+def validation_p(predictions: Sequence[Prediction], covariance: FloatArray) -> float:
+    """Lack-of-fit p-value on runs never used, the parameters' own uncertainty included; NaN where
+    there are none."""
+    return lack_of_fit_p(*held_out_misfit(predictions, covariance))
 
 
 def assess(fit: Fit, data: Dataset) -> Assessment:

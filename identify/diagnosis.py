@@ -33,6 +33,7 @@ from identify.results import (
 )
 from identify.structure import Effect, Structure
 from identify.trace import ALPHA, Cancelled, Tried
+from identify.trace.tried import tried as as_tried
 
 Progress = Callable[[float, str], None]
 
@@ -116,11 +117,11 @@ def diagnose(
             lambda share, text: report(0.95 + 0.04 * share, text),
         )  # fmt: skip
 
-    verdict, chosen, explanation = _judge(declared.significant, tried, base, data)
+    verdict, chosen, explanation = _judge(declared, tried, data)
     if chosen is not None and (chosen.spread is not None or chosen.fit_p < DOUBTFUL):
         # a spread takes up much, and so may a law: not where one does better that nobody knows
         tried = trace.against_chance(tried, pieces())
-        verdict, chosen, explanation = _judge(declared.significant, tried, base, data, pieces())
+        verdict, chosen, explanation = _judge(declared, tried, data, pieces())
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
@@ -173,12 +174,16 @@ def _with_lock_in(
 
 @dataclass(frozen=True)
 class _Declared:
-    """A fit of the declared model, and whether it leaves more than noise."""
+    """The declared model, fitted, and whether it leaves more than noise."""
 
-    fit: Fit
+    model: Tried
     assessment: Assessment
     scores: dict[str, trace.ScoreTest]
     p_value: float
+
+    @property
+    def fit(self) -> Fit:
+        return self.model.fit
 
     @property
     def significant(self) -> bool:
@@ -192,19 +197,11 @@ def _declared(
     assessment = assess.assess(fit, data)
     usable = [e for e in catalogue if trace.usable(e, data, structure)] if fit.converged else []
     scores = trace.score_tests(structure, data, fit, usable, executor)
-    tests = [
-        assess.lack_of_fit_p(fit.chi2, fit.dof),
-        _validation_p(assessment, data),
-        trace.family_p(list(scores.values())),
-    ]
+    model = as_tried((), fit, data)
+    tests = [model.fit_p, model.validation_p, trace.family_p(list(scores.values()))]
     taken = [p for p in tests if np.isfinite(p)]
     # the least of so many: corrected for that (Bonferroni)
-    return _Declared(fit, assessment, scores, min(1.0, len(taken) * min(taken)))
-
-
-def _validation_p(before: Assessment, data: Dataset) -> float:
-    held = [assess.predict(before.structure, before.fit.theta, b) for b in data.validation]
-    return assess.validation_p(held, before.fit.covariance) if held else float("nan")
+    return _Declared(model, assessment, scores, min(1.0, len(taken) * min(taken)))
 
 
 def signature(assessment: Assessment, scores: Mapping[str, trace.ScoreTest]) -> dict[str, Any]:
@@ -254,17 +251,16 @@ def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float
 
 
 def _judge(
-    significant: bool,
+    declared: _Declared,
     tried: Sequence[Tried],
-    base: Fit,
     data: Dataset,
     pieces: Sequence[Tried] = (),
 ) -> tuple[Verdict, Tried | None, str]:
     """Verdict, the candidate it rests on, and the reason in words; `pieces` are freely shaped, and
     what is far less likely than one of them is not claimed."""
-    if not significant:
+    if not declared.significant:
         return "no_discrepancy", None, "The declared model explains the data to within noise."
-    good = [t for t in tried if t.explains and trace.accounts(t, base, tried)]
+    good = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
     good = [t for t in good if not trace.outdone(t, pieces)]
     if good:
         best = trace.best_form(good)
@@ -283,7 +279,7 @@ def _judge(
         names = ", ".join(t.words for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."
     ranked = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)
-    near = _nearly(ranked, base.chi2, data)
+    near = _nearly(ranked, declared.fit.chi2, data)
     if near is not None:
         words = near.words
         return "traced", near, (

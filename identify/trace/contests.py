@@ -73,21 +73,23 @@ def _left(t: Tried, effects: tuple[Effect, ...]) -> tuple[Structure, FloatArray]
 
 
 def eliminate(candidate: Tried, data: Dataset) -> Tried:
-    """Backward elimination: effects without which the fit is no worse than chance are dropped."""
+    """Backward elimination: effects without which the fit is no worse than chance are dropped. Of
+    what predicts the held-out runs, they have a say in it."""
     current = candidate
     while len(current.effects) > 1:
         smaller = []
         for leave in current.effects:
             rest = tuple(e for e in current.effects if e is not leave)
-            fit = with_fewer(current, rest, data)
-            gain = fit.chi2 - current.fit.chi2
-            freedom = current.fit.theta.size - fit.theta.size
+            without = tried(rest, with_fewer(current, rest, data), data)
+            gain = without.fit.chi2 - current.fit.chi2
+            if current.adequate:
+                gain = without.chi2_of_all - current.chi2_of_all
+            freedom = current.fit.theta.size - without.fit.theta.size
             if np.isfinite(gain) and chi2_tail(gain, freedom) > ALPHA / len(CATALOGUE):
-                smaller.append((gain, rest, fit))
+                smaller.append((gain, without))
         if not smaller:
             break
-        _, rest, fit = min(smaller, key=lambda item: item[0])
-        current = tried(rest, fit, data)
+        _, current = min(smaller, key=lambda item: item[0])
     return current
 
 

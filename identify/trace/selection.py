@@ -274,7 +274,8 @@ class _Searching:
             certain = [t for t in self.tried if t.spread is None]
             self.tried += reformed(certain, self.data, self.forms, self.run, self.done)
         self._contest()
-        claimed = any(t.explains and accounts(t, self.base, self.tried) for t in self.tried)
+        declared = tried((), self.base, self.data)
+        claimed = any(t.explains and accounts(t, declared, self.tried) for t in self.tried)
         first = foremost([t for t in self.tried if t.spread is None and t.plausible])
         if self.explained and not claimed and first is not None and not first.explains:
             self.report(0.95, "trying other forms of the foremost")

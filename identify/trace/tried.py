@@ -43,6 +43,7 @@ class Tried:
     fit_p: float
     validation_p: float
     spread: Spread | None = None
+    held_out: tuple[float, int] = (0.0, 0)  # χ² of those runs, and of how many residuals
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -85,6 +86,16 @@ class Tried:
         return _evidence(self.fit, len(self.spread.sizes)) + self.spread.penalty
 
     @property
+    def chi2_of_all(self) -> float:
+        """χ² of fitted and held-out runs: as if all had been fitted."""
+        return self.fit.chi2 + self.held_out[0]
+
+    @property
+    def excess(self) -> float:
+        """What it leaves of all runs beyond noise."""
+        return self.chi2_of_all - assess.noise_misfit(self.fit.dof + self.held_out[1])
+
+    @property
     def estimates(self) -> dict[str, Estimate]:
         own = {} if self.spread is None else self.spread.sizes
         return {**self.fit.estimates, **own}
@@ -114,12 +125,10 @@ def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
 def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
     """A refitted candidate with its adequacy on fitted and held-out runs."""
     held_out = [assess.predict(fit.structure, fit.theta, b) for b in data.validation]
-    if held_out:
-        error = assess.relative_error(held_out)
-        p_out = assess.validation_p(held_out, fit.covariance)
-    else:
-        error, p_out = float("nan"), float("nan")
-    return Tried(effects, fit, error, assess.lack_of_fit_p(fit.chi2, fit.dof), p_out)
+    error = assess.relative_error(held_out) if held_out else float("nan")
+    misfit_out = assess.held_out_misfit(held_out, fit.covariance)
+    fit_p, p_out = (assess.lack_of_fit_p(*m) for m in ((fit.chi2, fit.dof), misfit_out))
+    return Tried(effects, fit, error, fit_p, p_out, held_out=misfit_out)
 
 
 def best_by_name(tries: Sequence[Tried]) -> list[Tried]:
@@ -216,27 +225,27 @@ def _extends(t: Tried, best: Tried) -> bool:
     return t.fit.theta.size > best.fit.theta.size and best.parts <= t.parts | general
 
 
-def gain_p(t: Tried, without: Fit) -> float:
-    """Likelihood ratio of `t` against a model with fewer effects, corrected for those asked."""
+def _gain_p(gain: float, t: Tried, without: Fit) -> float:
+    """Chance of a gain in χ² of `t` on a model with fewer effects, corrected for those asked."""
     freedom = max(t.fit.theta.size - without.theta.size, 1)
-    return min(1.0, chi2_tail(without.chi2 - t.fit.chi2, freedom) * len(CATALOGUE))
+    return min(1.0, chi2_tail(gain, freedom) * len(CATALOGUE))
 
 
-def accounts(t: Tried, declared: Fit, tries: Sequence[Tried]) -> bool:
+def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     """Whether the misfit that is left without one of the effects goes with it: more than chance
     takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
     worse. What takes a part of little may leave the cause behind, under the threshold. A spread
     does so by widening the noise: its likelihood is penalised for that, and must still gain, on
     the law beside it and, so that one is claimed, on the spread alone."""
     fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
-    without = min([declared, *(o.fit for o in fewer)], key=lambda fit: fit.chi2)
-    excess, left = (f.chi2 - assess.noise_misfit(f.dof) for f in (without, t.fit))
+    without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
+    mostly = t.excess < without.excess / 3
     if t.spread is not None:
         alone = [o.evidence for o in tries if o.spread and o.parts < t.parts]
-        least = min([_evidence(without), *alone])
-        return left < excess / 3 and t.evidence < least - EVIDENCE
+        return mostly and t.evidence < min([without.evidence, *alone]) - EVIDENCE
     worse = any(_predicts_worse(t, o) for o in fewer)
-    return gain_p(t, without) < ALPHA and left < excess / 3 and not worse
+    gain = without.chi2_of_all - t.chi2_of_all
+    return _gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
 
 
 def _predicts_worse(t: Tried, o: Tried) -> bool:
@@ -262,7 +271,7 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
         chi2=t.fit.chi2,
         chi2_per_dof=t.fit.chi2_per_dof,
         validation_error=t.validation_error,
-        p_value=gain_p(t, declared),
+        p_value=_gain_p(declared.chi2 - t.fit.chi2, t, declared),
         parameters={n: e for n, e in t.estimates.items() if n in own},
         equivalent_to=tuple(equal),
         plausible=t.plausible,
