@@ -219,6 +219,16 @@ def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
     return canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
 
 
+def _as_declared(task: _Task) -> Fit | None:
+    """From the polynomial balance of the richer structure, exact where nothing else is lacking."""
+    assert task.richer is not None
+    larger = task.structure.with_effects(task.effect)
+    found = [task.richer.parameters.plain(t) for t in candidates(task.richer, task.data)]
+    starts = coarse(larger, task.data, [by_name(task.effect, larger, p) for p in found])[:1]
+    fits = [fit_orbits(larger, task.data, s.theta) for s in starts]
+    return canonical(fits[0], task.data) if fits else None
+
+
 def canonical(fit: Fit, data: Dataset) -> Fit:
     """The same fit with its effects' parameters named by the effects' own rules."""
     structure = fit.structure
@@ -293,6 +303,8 @@ def try_effects(
         staged.append((task, starts))
         progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
     out = _finite(executor.map(_straight, _promising(tasks, executor, keep)), data)
+    exact = executor.map(_as_declared, [t for t in tasks if t.richer is not None])
+    out += _finite((fit for fit in exact if fit is not None), data)
     near = not far or _one_stands_out([s[0].cost for _, s in staged if s], shares[0])
     if near:
         out += _refits(staged, out, data, executor, keep, progress)
