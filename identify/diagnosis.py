@@ -278,8 +278,11 @@ def _judge(
             return "traced", best, said + "".join(forms)
         names = ", ".join(t.words for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."
-    ranked = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)
-    near = _nearly(ranked, declared.fit.chi2, data)
+    least = declared.fit.chi2  # what leaves more with an effect than without has lost its way
+    ranked = sorted(
+        (t for t in tried if t.plausible and t.fit.chi2 < least), key=lambda t: t.fit.chi2
+    )
+    near = _nearly(ranked, least, data)
     if near is not None:
         words = near.words
         return "traced", near, (

@@ -153,6 +153,18 @@ def test_two_further_modes_wherever_they_are(seed: int, tmp_path: Path) -> None:
     assert best.explains
 
 
+def test_two_further_modes_beside_another_effect(tmp_path: Path) -> None:
+    """No pair of other effects comes near; from the modes alone the other is found."""
+    gain = {"channel_mismatch/gain": {"gain": 0.01}}
+    ready = thesis_campaign(tmp_path, 7, gain, noise_db=45.0, preset="thesis-four-mode")
+    keys = ("acoustic_mode:mode", "acoustic_mode:two_modes", "channel_mismatch:gain", "flame_delay")
+    best, rivals = search_for(ready, *keys)
+    assert [e.key for e in best.effects] == ["acoustic_mode:two_modes", "channel_mismatch:gain"]
+    assert rivals == []
+    found = best.estimates["channel_mismatch.gain"]
+    assert abs(found.value - 0.01) < 4 * found.stderr
+
+
 def test_other_effects_at_the_same_place_start_from_where_one_explains(tmp_path: Path) -> None:
     """A lag and a short delay of the flame predict nearly the same; a speaker's lag stands
     elsewhere."""

@@ -28,7 +28,7 @@ from identify.trace.contests import (
 )
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.scores import ScoreTest, score_tests
-from identify.trace.stages import started_again, try_effects
+from identify.trace.stages import as_declared, started_again, try_effects
 from identify.trace.tried import (
     BEATEN,
     EVIDENCE,
@@ -106,6 +106,8 @@ def search(
             if not nowhere and base.chi2_per_dof > GROSS and _least(found) > MUCH:
                 found += going.pairs(singles)
         level = best_by_name(found)
+        if size == 2 and not going.explained:
+            level = [*going.of_more_modes(level), *level]
     going.contest()
     everything = against_chance(going.tried)
     return Search(
@@ -211,6 +213,19 @@ class _Searching:
             shorten = t.adequate or any(t is b for b in best)
             self.tried.append(eliminate(t, self.data) if shorten else t)
         return grown
+
+    def of_more_modes(self, level: Sequence[Tried]) -> list[Tried]:
+        """Several modes more, from the data alone, where they leave less than all of `level`: more
+        of them than of other effects may be missing, and no pair comes near then."""
+        least = min((misfit(t) for t in level), default=np.inf)
+        if least <= GROSS * self.base.dof:
+            return []
+        self.report(0.6, "trying several modes more")
+        several = [e for e in self.available if e.refines and e.restated(self.structure)]
+        fits = self.run.map(as_declared, [(self.structure, self.data, e) for e in several])
+        found = [tried(f.structure.effects, f, self.data) for f in fits if np.isfinite(f.chi2)]
+        self.tried += found
+        return [t for t in found if misfit(t) < least]
 
     def _led_to_the_end(self, grown: Sequence[Tried]) -> list[Tried]:
         """With what had not converged led on, and, if still nothing explains, in other forms."""

@@ -24,6 +24,7 @@ from identify.start import (
     corrected,
     dense_placements,
     every_start,
+    fit_from_data,
     physical_starts,
     polish,
     signed_starts,
@@ -219,7 +220,7 @@ def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
     return canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
 
 
-def _as_declared(task: _Task) -> Fit | None:
+def _balanced(task: _Task) -> Fit | None:
     """From the polynomial balance of the richer structure, exact where nothing else is lacking."""
     assert task.richer is not None
     larger = task.structure.with_effects(task.effect)
@@ -227,6 +228,15 @@ def _as_declared(task: _Task) -> Fit | None:
     starts = coarse(larger, task.data, [by_name(task.effect, larger, p) for p in found])[:1]
     fits = [fit_orbits(larger, task.data, s.theta) for s in starts]
     return canonical(fits[0], task.data) if fits else None
+
+
+def as_declared(item: tuple[Structure, Dataset, Effect]) -> Fit:
+    """An effect fitted from the data alone, as if the model had been declared with it."""
+    structure, data, effect = item
+    richer = effect.restated(structure)
+    assert richer is not None
+    larger, found = structure.with_effects(effect), fit_from_data(richer, data)
+    return fit_orbits(larger, data, by_name(effect, larger, found.values), continuation=(0.0,))
 
 
 def canonical(fit: Fit, data: Dataset) -> Fit:
@@ -303,8 +313,9 @@ def try_effects(
         staged.append((task, starts))
         progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
     out = _finite(executor.map(_straight, _promising(tasks, executor, keep)), data)
-    exact = executor.map(_as_declared, [t for t in tasks if t.richer is not None])
-    out += _finite((fit for fit in exact if fit is not None), data)
+    exact = executor.map(_balanced, [t for t in tasks if t.richer is not None])
+    balanced = _finite((fit for fit in exact if fit is not None), data)
+    out += [t for t in balanced if t.adequate]  # the others are local minima
     near = not far or _one_stands_out([s[0].cost for _, s in staged if s], shares[0])
     if near:
         out += _refits(staged, out, data, executor, keep, progress)
