@@ -265,7 +265,7 @@ def _judge(
     if good:
         best = trace.best_form(good)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
-        others = trace.rivals(best, trace.best_by_name([*good, *spreads]))
+        others = trace.rivals(best, [*good, *spreads])
         words = best.words
         if not others:
             open_ = trace.other_forms(best, good)
@@ -330,8 +330,9 @@ def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried |
 
 def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:
     ordered = trace.best_by_name(tried)
-    if chosen is not None:  # what the verdict rests on stands first
-        ordered = [chosen, *(t for t in ordered if t.key != chosen.key)]
+    if chosen is not None:  # what the verdict rests on stands first, its rivals as they are such
+        first = [chosen, *trace.rivals(chosen, tried)]
+        ordered = [*first, *(t for t in ordered if t.key not in {f.key for f in first})]
     good = [t for t in ordered if t.explains]
     out = []
     for t in ordered[:SHOWN]:
@@ -386,8 +387,7 @@ def _next(
     """What to measure to tell the rivals apart, or to see the unexplained rest."""
     if chosen is None or verdict not in ("ambiguous", "unexplained"):
         return None
-    best = trace.best_by_name(tried)
-    others = trace.rivals(chosen, best) if verdict == "ambiguous" else best
+    others = trace.rivals(chosen, tried) if verdict == "ambiguous" else trace.best_by_name(tried)
     group = [chosen, *(t for t in others if t.plausible and t.key != chosen.key)]
     rivals = [design.Rival(t.words, t.fit) for t in group]
     return design.next_experiment(rivals, ready, verdict)

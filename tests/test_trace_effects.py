@@ -258,7 +258,7 @@ def test_rivals_are_sought_in_every_place_of_a_pair(tmp_path: Path) -> None:
     base = start.fit_from_data(ready.structure, ready.data)
     found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
     best = trace.best_form([t for t in found.tried if t.adequate and t.plausible])
-    names = {best.key, *(t.key for t in trace.rivals(best, trace.best_by_name(found.tried)))}
+    names = {best.key, *(t.key for t in trace.rivals(best, found.tried))}
     assert names == {("flame_delay", "parameter_drift"), ("flame_dynamics", "parameter_drift")}
 
 
@@ -562,6 +562,17 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     assert trace.rivals(other, [replace(beside, validation_p=1e-17)]) == []
 
 
+def test_a_form_that_extends_the_best_hides_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A distributed delay is a delay and more; a resonance of the flame that does as well is not,
+    though it goes by the same name and is a little less likely."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    delay = tried_as(fitted(10, 1.0), "flame_delay")
+    distributed = tried_as(fitted(11, 0.97), "flame_dynamics:distributed_delay")
+    resonance = tried_as(fitted(11, 0.98), "flame_dynamics:second_order")
+    assert trace.rivals(delay, [delay, distributed]) == []
+    assert trace.rivals(delay, [delay, distributed, resonance]) == [resonance]
+
+
 def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -639,7 +650,7 @@ def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
     good = [t for t in found if t.explains and trace.accounts(t, declared, found)]
     best = trace.best_form(good)
     assert best.key_of_forms == ("actuator_nonlinearity:quadratic", "drive_scatter")
-    assert trace.rivals(best, trace.best_by_name(found)) == []
+    assert trace.rivals(best, found) == []
     a2 = best.estimates["actuator_nonlinearity.a2"]
     assert abs(a2.value + 0.008) < 4 * a2.stderr
     assert a2.stderr < 1e-4
@@ -662,7 +673,7 @@ def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
     best = trace.best_form(good)
     assert best.words == "parameter_drift:speaker_gain + parameter_drift:random"
     assert best.names == ("parameter_drift", "parameter_drift")
-    assert trace.rivals(best, trace.best_by_name(found)) == []
+    assert trace.rivals(best, found) == []
     assert trace.other_forms(best, good) == {"parameter_drift": ()}
     change = best.estimates["parameter_drift.relative_change"]
     over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes

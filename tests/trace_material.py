@@ -91,7 +91,7 @@ def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tri
     base = start.fit_from_data(ready.structure, ready.data)
     found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
     best = trace.best_form([t for t in found.tried if t.explains])
-    return best, trace.rivals(best, trace.best_by_name(found.tried))
+    return best, trace.rivals(best, found.tried)
 
 
 def fitted(parameters: int, chi2_per_dof: float) -> Fit:

@@ -181,9 +181,10 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     What only adds an effect to one of them is none of its own. Among spreads the likelihood alone
     decides: how well the wanderings of a few runs fit a Gaussian says little of their cause; a law
     beside one must predict the held-out runs. A law may follow what chance did where a spread is
-    about as likely, or likelier though it looks not quite random.
+    about as likely, or likelier though it looks not quite random. Each in its best form that is a
+    rival: one that extends `best` must not hide another.
     """
-    found = [
+    every = [
         t
         for t in others
         if t.key != best.key
@@ -192,6 +193,7 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         and not best.parts < t.parts
         and not _extends(t, best)
     ]
+    found = best_by_name(every)
     return [t for t in found if not any(o.parts < t.parts for o in found)]
 
 
