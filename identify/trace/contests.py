@@ -40,6 +40,7 @@ Progress = Callable[[float, str], None]
 _Exchange = tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]
 
 UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
+SETTLED = 16  # of the nearest of them are led on
 RUNNERS_UP = 2  # sets whose other forms are tried for that
 NEARBY = 0.7  # of the logarithm, where another form is matched
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
@@ -388,12 +389,15 @@ def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]
     good = [t for t in tries if t.explains]
     if not good:
         return []
-    least = best_form(good).evidence + UNSETTLED
+    best = best_form(good)
     near = [
         t
         for t in best_of_each_form([t for t in tries if t.spread is None])
-        if not t.fit.converged and t.evidence < least
+        if not t.fit.converged
+        and t.evidence < best.evidence + UNSETTLED
+        and not best.parts < t.parts  # no rival, whatever it comes to
     ]
+    near = sorted(near, key=lambda t: t.evidence)[:SETTLED]
     return _where_better(near, run.map(_to_the_end, [(t, data) for t in near]), data)
 
 

@@ -14,6 +14,7 @@ from identify.scatter import Spread, fit_scatter
 from identify.start import fit_from_data
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
+    BEHIND,
     at_the_same_place,
     eliminate,
     in_each_form,
@@ -99,6 +100,8 @@ def search(
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
+        if size > 2:  # one of two effects may leave much; two of three hardly more than others do
+            parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
         nowhere = size == 2 and not _a_place_to_grow_from(singles)
         found = going.pairs(singles) if nowhere else going.grown(parents)
         if size == 2:
