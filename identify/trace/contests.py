@@ -12,9 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from identify.chances import chi2_tail
 from identify.dataset import Dataset
-from identify.effects import CATALOGUE
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
@@ -28,6 +26,7 @@ from identify.trace.tried import (
     best_by_name,
     best_form,
     best_of_each_form,
+    gain_p,
     key_of_forms,
     misfit,
     tried,
@@ -85,8 +84,7 @@ def eliminate(candidate: Tried, data: Dataset) -> Tried:
             gain = without.fit.chi2 - current.fit.chi2
             if current.adequate:
                 gain = without.chi2_of_all - current.chi2_of_all
-            freedom = current.fit.theta.size - without.fit.theta.size
-            if np.isfinite(gain) and chi2_tail(gain, freedom) > ALPHA / len(CATALOGUE):
+            if np.isfinite(gain) and gain_p(gain, current, without.fit) > ALPHA:
                 smaller.append((gain, without))
         if not smaller:
             break

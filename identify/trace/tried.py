@@ -227,7 +227,7 @@ def _extends(t: Tried, best: Tried) -> bool:
     return t.fit.theta.size > best.fit.theta.size and best.parts <= t.parts | general
 
 
-def _gain_p(gain: float, t: Tried, without: Fit) -> float:
+def gain_p(gain: float, t: Tried, without: Fit) -> float:
     """Chance of a gain in χ² of `t` on a model with fewer effects, corrected for those asked."""
     freedom = max(t.fit.theta.size - without.theta.size, 1)
     return min(1.0, chi2_tail(gain, freedom) * len(CATALOGUE))
@@ -247,7 +247,7 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
         return mostly and t.evidence < min([without.evidence, *alone]) - EVIDENCE
     worse = any(_predicts_worse(t, o) for o in fewer)
     gain = without.chi2_of_all - t.chi2_of_all
-    return _gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
+    return gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
 
 
 def _predicts_worse(t: Tried, o: Tried) -> bool:
@@ -273,7 +273,7 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
         chi2=t.fit.chi2,
         chi2_per_dof=t.fit.chi2_per_dof,
         validation_error=t.validation_error,
-        p_value=_gain_p(declared.chi2 - t.fit.chi2, t, declared),
+        p_value=gain_p(declared.chi2 - t.fit.chi2, t, declared),
         parameters={n: e for n, e in t.estimates.items() if n in own},
         equivalent_to=tuple(equal),
         plausible=t.plausible,
