@@ -73,7 +73,7 @@ def diagnose(
     ready = prepare(campaign, structure)
     report(0.05, "fitting the declared model")
     recorded = ready.data
-    data, fit = drive.refitted(start.fit_from_data(ready.structure, recorded), recorded)
+    data, fit = drive.refitted(start.fit_declared(ready.structure, recorded), recorded)
     ready = replace(ready, data=data)
     run = executor or InProcess()
     declared = _declared(fit, ready, catalogue, run)

@@ -131,7 +131,7 @@ def fit_structure(structure: Structure, data: Dataset) -> Fit:
 
     Effects are added one after another to the fit without them, each led in from its own starts.
     """
-    fit = start.fit_from_data(replace(structure, effects=()), data)
+    fit = start.fit_declared(replace(structure, effects=()), data)
     for effect in structure.effects:
         grown = try_effects(
             fit.structure,

@@ -23,7 +23,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from identify import balance
+from identify import assess, balance
 from identify.dataset import Batch, Dataset
 from identify.fit import (
     Fit,
@@ -48,6 +48,7 @@ DISTANT = 40  # of those from the slow flow, of either sign, where the declared 
 NEARLY = 100.0  # χ²/dof beyond which the model is to blame, not a mode at the wrong place
 WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_weak_pulls`
 LONG = 600  # iterations that lead on what comes nearest and has not converged
+REFUSED = 1e-3  # chance of held-out runs below which another minimum is sought that suits them too
 FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
 
@@ -593,6 +594,29 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
     return min(found, key=lambda f: (not f.converged, f.chi2))
 
 
+def fit_declared(structure: Structure, data: Dataset) -> Fit:
+    """`fit_from_data`, unless the held-out runs refuse what it found and have a solution in common
+    with the fitted ones: a few runs may have several, of which they are fitted by the wrong one.
+
+    The fit is of the fitted runs alone, from there.
+    """
+    fit = fit_from_data(structure, data)
+    if not (data.validation and _adequate(fit)) or not _refused(fit, data):
+        return fit
+    everything = replace(data, fit=(*data.fit, *data.validation), validation=())
+    whole = fit_from_data(structure, everything)
+    if not _adequate(whole):
+        return fit
+    other = fit_orbits(structure, data, whole.theta, continuation=(0.0,))
+    return other if other.chi2 < _noise(other.dof) and not _refused(other, data) else fit
+
+
+def _refused(fit: Fit, data: Dataset) -> bool:
+    """Whether the held-out runs are beyond noise and the parameters' own uncertainty."""
+    held_out = [assess.predict(fit.structure, fit.theta, b) for b in data.validation]
+    return assess.validation_p(held_out, fit.covariance) < REFUSED
+
+
 def _moved(
     structure: Structure, near: Fit, free_hz: float, placement: Sequence[float]
 ) -> list[FloatArray]:
@@ -611,7 +635,12 @@ def _moved(
 
 
 def _adequate(fit: Fit) -> bool:
-    return fit.converged and fit.chi2 < fit.dof + 5 * np.sqrt(2 * fit.dof)
+    return fit.converged and fit.chi2 < _noise(fit.dof)
+
+
+def _noise(dof: int) -> float:
+    """χ² that noise hardly exceeds: five standard deviations above its mean."""
+    return dof + 5 * float(np.sqrt(2 * dof))
 
 
 def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) -> list[Fit]:
