@@ -22,14 +22,16 @@ NEGLIGIBLE = 1e-3  # of a coefficient's own variance
 
 def refitted(fit: Fit, data: Dataset, model: Fit | None = None) -> tuple[Dataset, Fit]:
     """`data`, as recorded, with the drive's uncertainty as `model` passes it on (default: `fit`),
-    and `fit` repeated on them; the same objects where it is negligible.
+    and `fit` repeated on them; the same objects where it is negligible, or where nothing comes of
+    a fit that is far from the data.
 
     As recorded: covariances that hold the drive's share already would get it twice.
     """
     counted = with_uncertain_drive(model or fit, data)
     if counted is data:
         return data, fit
-    return counted, fit_orbits(fit.structure, counted, fit.theta, continuation=(0.0,))
+    again = fit_orbits(fit.structure, counted, fit.theta, continuation=(0.0,))
+    return (counted, again) if np.isfinite(again.chi2) else (data, fit)
 
 
 def with_uncertain_drive(fit: Fit, data: Dataset) -> Dataset:

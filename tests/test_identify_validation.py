@@ -6,8 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from identify.drive import with_uncertain_drive
-from identify.fit import Fit, OrbitResidual, covariance_of, fit_orbits, levenberg_marquardt
+from identify import drive
+from identify.fit import (
+    Fit,
+    OrbitResidual,
+    covariance_of,
+    failed,
+    fit_orbits,
+    levenberg_marquardt,
+)
 from identify.harmonics import VARIANCE_DOF
 from identify.identification import undetermined
 from identify.profile import intervals
@@ -91,7 +98,7 @@ def test_an_uncertain_drive_is_part_of_the_covariance() -> None:
         told = replace(data, fit=(replace(
             noisy, at=replace(b.at, drive=wrong), drive_noise=variance),))  # fmt: skip
         fit = fit_orbits(STRUCTURE, told, theta(STRUCTURE), continuation=(0.0,))
-        wider = with_uncertain_drive(fit, told)
+        wider = drive.with_uncertain_drive(fit, told)
         again = fit_orbits(STRUCTURE, wider, fit.theta, continuation=(0.0,))
         before.append(fit.chi2_per_dof)
         after.append(again.chi2_per_dof)
@@ -99,7 +106,24 @@ def test_an_uncertain_drive_is_part_of_the_covariance() -> None:
     assert np.mean(before) > 2
     assert np.mean(after) == pytest.approx(VARIANCE_DOF / (VARIANCE_DOF - 2), abs=0.2)
     quiet = replace(data, fit=(replace(b, drive_noise=variance * 1e-6),))
-    assert with_uncertain_drive(fit, quiet) is quiet
+    assert drive.with_uncertain_drive(fit, quiet) is quiet
+
+
+def test_a_fit_that_is_lost_with_an_uncertain_drive_is_kept_as_it_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    data = clean(WIDE, 1e-4)
+    (b,) = data.fit
+    variance = (4e-4 * np.abs(b.at.drive[:, 0])) ** 2
+    told = replace(data, fit=(replace(b, drive_noise=variance),))
+    fit = fit_orbits(STRUCTURE, told, theta(STRUCTURE), continuation=(0.0,))
+    counted, again = drive.refitted(fit, told)
+    assert counted is not told
+    assert again is not fit
+    monkeypatch.setattr(drive, "fit_orbits", lambda s, d, t, **_: failed(s, d, t, "lost"))
+    kept = drive.refitted(fit, told)
+    assert kept[0] is told
+    assert kept[1] is fit
 
 
 def test_a_run_without_a_steady_state_is_infinitely_far_and_warns_of_nothing() -> None:
