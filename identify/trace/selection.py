@@ -343,13 +343,13 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
 
 
 def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
-    """Effects beside a spread that explains the data, fitted from there without it.
+    """Effects beside a spread that comes to the noise, fitted from there without it.
 
     A spread forgives the runs that had led the effect astray, and may have been needed for no more.
     """
     out = []
     for t in tries:
-        if t.explains:
+        if t.adequate:
             fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.003, 0.0))
             if np.isfinite(fit.chi2):
                 out.append(tried(t.fit.structure.effects, fit, data))
