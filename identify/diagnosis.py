@@ -332,7 +332,8 @@ def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tupl
     ordered = trace.best_by_name(tried)
     if chosen is not None:  # what the verdict rests on stands first, its rivals as they are such
         first = [chosen, *trace.rivals(chosen, tried)]
-        ordered = [*first, *(t for t in ordered if t.key not in {f.key for f in first})]
+        named = {t.key for t in first}
+        ordered = [*first, *(t for t in ordered if t.key not in named)]
     good = [t for t in ordered if t.explains]
     out = []
     for t in ordered[:SHOWN]:

@@ -397,7 +397,7 @@ class _State:
     grow: float = 2.0
     refused: int = 0
     iterations: int = 0
-    factors: "_Factors | None" = None
+    factors: _Factors | None = None
     ended: str | None = None
     converged: bool = False
 

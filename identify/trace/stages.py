@@ -143,16 +143,16 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
     first = task.shares[0]
     starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
     if task.richer is not None:
-        rows = _named_starts(task, every_start(task.richer, task.rough)[:6])
+        rows = _named(task, [s.theta for s in every_start(task.richer, task.rough)[:6]])
         starts += polish(larger, task.rough, coarse(larger, task.rough, rows), (ROUGH,), 8)[:2]
     return polish(larger, task.seen, starts, (first,), 8)[:3]
 
 
-def _named_starts(task: _Task, starts: Sequence[CoarseStart]) -> list[FloatArray]:
-    """Unknowns with the effect from starts of the richer structure."""
+def _named(task: _Task, thetas: Iterable[FloatArray]) -> list[FloatArray]:
+    """Unknowns with the effect from those of the richer structure."""
     assert task.richer is not None
     larger = task.structure.with_effects(task.effect)
-    found = [task.richer.parameters.plain(s.theta) for s in starts]
+    found = [task.richer.parameters.plain(theta) for theta in thetas]
     return [by_name(task.effect, larger, p) for p in found]
 
 
@@ -166,7 +166,7 @@ def _from_afar(task: _Task) -> list[CoarseStart]:
         dense = dense_placements(task.richer.mode_count - 1)
         signed = signed_starts(task.richer, task.rough, placements=dense)[:OF_MODES]
         found = polish(task.richer, task.rough, signed, (ROUGH,), 6)[:2]
-        starts += coarse(larger, task.rough, _named_starts(task, found))
+        starts += coarse(larger, task.rough, _named(task, [s.theta for s in found]))
     led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
     return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
 
@@ -224,10 +224,10 @@ def _balanced(task: _Task) -> Fit | None:
     """From the polynomial balance of the richer structure, exact where nothing else is lacking."""
     assert task.richer is not None
     larger = task.structure.with_effects(task.effect)
-    found = [task.richer.parameters.plain(t) for t in candidates(task.richer, task.data)]
-    starts = coarse(larger, task.data, [by_name(task.effect, larger, p) for p in found])[:1]
-    fits = [fit_orbits(larger, task.data, s.theta) for s in starts]
-    return canonical(fits[0], task.data) if fits else None
+    starts = coarse(larger, task.data, _named(task, candidates(task.richer, task.data)))
+    if not starts:
+        return None
+    return canonical(fit_orbits(larger, task.data, starts[0].theta), task.data)
 
 
 def as_declared(item: tuple[Structure, Dataset, Effect]) -> Fit:
