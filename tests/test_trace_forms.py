@@ -262,3 +262,13 @@ def test_an_amplifier_s_crossover() -> None:
     seeded = drive(dual.Dual(np.array([[0.1]]), np.ones((1, 1, 1))))
     difference = (drive(0.101) - drive(0.099)) / 2e-3
     np.testing.assert_allclose(seeded.d[..., 0], difference, atol=2e-3)
+
+
+@pytest.mark.parametrize(
+    ("chi2_of_lowpass", "form"), [(119.0, "skew"), (117.0, "skew"), (112.0, "lowpass")]
+)
+def test_of_forms_as_likely_the_usual_one_is_named(chi2_of_lowpass: float, form: str) -> None:
+    """A delay and a lag of a microphone that is a few µs late differ by less than the noise."""
+    skew = tried_as(fitted(0, 1.0), "channel_mismatch:skew")
+    lowpass = tried_as(fitted(0, chi2_of_lowpass / 119), "channel_mismatch:lowpass")
+    assert trace.best_form([lowpass, skew]).effects[0].form == form

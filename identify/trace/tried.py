@@ -13,7 +13,7 @@ import numpy as np
 from identify import assess
 from identify.chances import chi2_tail
 from identify.dataset import Dataset
-from identify.effects import CATALOGUE
+from identify.effects import CANDIDATES, CATALOGUE
 from identify.effects.scatter import Scatter
 from identify.fit import Fit
 from identify.parameters import Estimate
@@ -31,6 +31,7 @@ EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very st
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
+USUAL = 3.0  # what a form must gain on one of the same effect that stands before it: more usual
 
 
 @dataclass(frozen=True)
@@ -155,16 +156,29 @@ def misfit(t: Tried) -> float:
 
 
 def best_form(good: Sequence[Tried]) -> Tried:
-    """The best of adequate candidates, in its preferred form."""
+    """The best of adequate candidates, in its preferred form: of those that do about as well, the
+    most usual one, by the candidates' order."""
     best = min(good, key=lambda t: t.evidence)
-    return min((t for t in good if t.key == best.key), key=_merit)
+    forms = [t for t in good if t.key == best.key]
+    least = min(_cost(t) for t in forms)
+    return min((t for t in forms if _cost(t) < least + USUAL), key=lambda t: (_places(t), _cost(t)))
+
+
+def _places(t: Tried) -> list[int]:
+    """Where its forms stand among the candidates; one that a caller brings, after them."""
+    order = {e.key: i for i, e in enumerate(CANDIDATES)}
+    return sorted(order.get(e.key, len(order)) for e in t.effects)
 
 
 def _merit(t: Tried) -> tuple[bool, float]:
     """Adequate ones first, by evidence; the others by misfit."""
     good = t.explains
-    handicap = PREFERENCE if any(e.empirical for e in t.effects) else 0.0
-    return not good, t.evidence + handicap if good else t.fit.chi2
+    return not good, _cost(t) if good else t.fit.chi2
+
+
+def _cost(t: Tried) -> float:
+    """Its evidence, what has no law behind it handicapped."""
+    return t.evidence + (PREFERENCE if any(e.empirical for e in t.effects) else 0.0)
 
 
 def foremost(tries: Sequence[Tried]) -> Tried | None:
