@@ -40,6 +40,7 @@ Numbers = tuple[float, ...]
 RATE_HZ, STEPS = 10_000, 4  # integration steps a sample
 H = 1 / (RATE_HZ * STEPS)
 SETTLE_S, RECORD_S = 12, 2
+MARGIN = RATE_HZ // 5 * STEPS  # on both sides of a record: filters and slopes end there
 WAVE_NUMBERS = np.array([3, 5, 7, 9]) * np.pi / (2 * 1.524)
 FLAME_M, MICROPHONES_M = 0.762, (0.6604, 0.7112)
 DENSITY, VELOCITY_SCALE = 1.2, 3e-7  # kg/m³; m/s a unit of the thesis's Y
@@ -188,7 +189,7 @@ def record(tube: Tube, frequency_hz: float, volts: float, rng: np.random.Generat
     force = np.array(
         [f * tube.speaker(1j * k * omega) * np.exp(-1j * k * phase) for k, f in enumerate(lines, 1)]
     )
-    count, skip = RECORD_S * RATE_HZ * STEPS, SETTLE_S * RATE_HZ * STEPS
+    count, skip = RECORD_S * RATE_HZ * STEPS + 2 * MARGIN, SETTLE_S * RATE_HZ * STEPS - MARGIN
     decay = np.exp(-TWO_PI * 3.0 * H)
     slow = lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.standard_normal(count + skip))
     each = (tube.frequency_hz, tube.damping, tube.at_flame, tube.velocity, tube.at_speaker)
@@ -209,7 +210,8 @@ def record(tube: Tube, frequency_hz: float, volts: float, rng: np.random.Generat
         spectrum = np.fft.rfft(pressures[1])
         spectrum[1:] *= response
         pressures[1] = np.fft.irfft(spectrum, count)
-    t = np.arange(count)[::STEPS] * H
+    pressures = [p[MARGIN:-MARGIN] for p in pressures]
+    t = np.arange(RECORD_S * RATE_HZ) / RATE_HZ
     rumble = 0.3 * lfilter([1], [1, -0.95], rng.standard_normal(t.size))
     out = [p[::STEPS] + tube.noise_pa * (rumble + rng.standard_normal(t.size)) for p in pressures]
     for hz, size in tube.tones:
