@@ -22,7 +22,7 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.fit import Fit
-from identify.structure import Conditions, Effect, Mode, Structure, declared_modes
+from identify.structure import MODAL, Conditions, Effect, Mode, Structure, declared_modes
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -150,11 +150,10 @@ def small_signal_slope(structure: Structure, p: dict[str, float]) -> float:
 
 
 def _modes(structure: Structure, p: dict[str, float]) -> list[Mode]:
-    names = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
     modes = declared_modes(p, structure.mode_count)
     for e in structure.effects:
         modes = e.modes(p, standing_still(), modes)
-    return [Mode(*(float(np.ravel(getattr(m, n))[0]) for n in names)) for m in modes]
+    return [Mode(*(float(np.ravel(getattr(m, n))[0]) for n in MODAL)) for m in modes]
 
 
 def _acoustics(modes: list[Mode]) -> StateSpace:

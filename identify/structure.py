@@ -37,6 +37,7 @@ NONLINEARITIES = ("polynomial", "saturation", "lagrange", "linear")
 
 BY_RUN = ("omega", "time", "flame_on", "identity", "free", "spacing_m")
 BY_HARMONIC = ("drive", "pressure", "velocity")
+MODAL = ("frequency_hz", "damping", "flame_residue", "speaker_residue")  # of each declared mode
 
 
 @dataclass(frozen=True)
@@ -490,8 +491,7 @@ def _lagrange_coefficients(nodes: Sequence[float], values: Sequence[Any]) -> lis
 
 def declared_modes(p: Values, count: int) -> list[Mode]:
     """The first `count` modes, without effects."""
-    names = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
-    return [Mode(*(p[f"mode{i}.{n}"] for n in names)) for i in range(1, count + 1)]
+    return [Mode(*(p[f"mode{i}.{n}"] for n in MODAL)) for i in range(1, count + 1)]
 
 
 def resonance(mode: Mode, s: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from identify.parameters import Parameter
 from identify.polynomial import Polynomial
 from identify.structure import (
+    MODAL,
     Branch,
     Conditions,
     Effect,
@@ -63,9 +64,8 @@ class AcousticMode(Effect):
     def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
         """Which of the modes are the further ones is a matter of naming: here those that take
         the smallest part in the response near mode 1, which sings and is never one of them."""
-        kinds = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
         count = structure.mode_count + self.more
-        table = [[values[f"mode{i}.{k}"] for k in kinds] for i in range(1, count + 1)]
+        table = [[values[f"mode{i}.{k}"] for k in MODAL] for i in range(1, count + 1)]
         f1, _, r1, a1 = table[0]
 
         def part(row: list[float]) -> float:

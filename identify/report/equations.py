@@ -10,7 +10,7 @@ from identify.parameters import Estimate
 from identify.report.page import paragraphs, table, tag, text
 from identify.report.words import listed, scientific, with_error
 from identify.results import Assessment
-from identify.structure import Structure
+from identify.structure import MODAL, Structure
 
 Numbers = Mapping[str, Estimate]
 
@@ -56,9 +56,8 @@ def equations_text(a: Assessment) -> str:
 
 
 def _modes(s: Structure, p: Numbers) -> list[list[str]]:
-    names = ("frequency_hz", "damping", "flame_residue", "speaker_residue")
     return [
-        [str(i), *(with_error(p[f"mode{i}.{n}"])[0] for n in names)]
+        [str(i), *(with_error(p[f"mode{i}.{n}"])[0] for n in MODAL)]
         for i in range(1, s.mode_count + 1)
     ]
 

@@ -16,7 +16,7 @@ from identify.dataset import Dataset
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
-from identify.structure import Effect, Structure
+from identify.structure import MODAL, Effect, Structure
 from identify.trace.stages import beside, known_sizes, louder, loudness, try_effects
 from identify.trace.tried import (
     ALPHA,
@@ -52,24 +52,45 @@ BEHIND = 3.0  # … and, where forms of a better one explain the data, than so m
 
 def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     """The values of `t` with some of its effects, not fitted again: as loud as with all."""
-    structure, theta = _left(t, effects)
+    structure = replace(t.fit.structure, effects=effects)
+    names, values = structure.parameters.names, t.fit.values
     gone = [e for e in t.effects if e not in effects]
-    theta = louder(theta, structure.parameters.names, loudness(data, gone, t.fit.values))
+    theta = structure.parameters.to_internal([values[n] for n in names])
+    theta = louder(theta, names, loudness(data, gone, values))
     return replace(t.fit, structure=structure, theta=theta)
 
 
 def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     """The fit with only some of the effects of `t`, started from its values."""
-    smaller, theta = _left(t, effects)
-    return fit_orbits(smaller, data, theta, continuation=(0.003, 0.0))
+    smaller = replace(t.fit.structure, effects=effects)
+    names = smaller.parameters.names
+    known = [t.fit.values]
+    for e in t.effects:
+        if e not in effects:
+            known += _with_a_mode_less(e, replace(smaller, effects=()), t.fit.values)
+    thetas = np.stack([smaller.parameters.to_internal([p[n] for n in names]) for p in known])
+    return fit_orbits(smaller, data, thetas, continuation=(0.003, 0.0))
 
 
-def _left(t: Tried, effects: tuple[Effect, ...]) -> tuple[Structure, FloatArray]:
-    """The structure with only some of the effects of `t`, and its unknowns as they are there."""
-    structure, values = replace(t.fit.structure, effects=effects), t.fit.values
-    return structure, structure.parameters.to_internal(
-        [values[n] for n in structure.parameters.names]
-    )
+def _with_a_mode_less(
+    gone: Effect, plain: Structure, values: Mapping[str, float]
+) -> list[dict[str, float]]:
+    """Values without an effect that adds a mode, of which it has the name only: any of those that
+    do not sing may be the one too many."""
+    richer, count = gone.restated(plain), plain.mode_count
+    if richer is None or richer.mode_count != count + 1:
+        return []
+    full = {**values, **gone.to_restated(plain, values)}
+    out = []
+    for left_out in range(2, count + 1):
+        stay = [i for i in range(1, count + 2) if i != left_out]
+        moved = {
+            f"mode{new}.{kind}": full[f"mode{old}.{kind}"]
+            for new, old in enumerate(stay, start=1)
+            for kind in MODAL
+        }
+        out.append({**values, **moved})
+    return out
 
 
 def eliminate(candidate: Tried, data: Dataset) -> Tried:
@@ -323,7 +344,7 @@ def in_their_places(
     data: Dataset,
     available: Sequence[Effect],
     run: Executor,
-    extended: set[tuple[str, ...]],
+    extended: Mapping[tuple[str, ...], float],
     report: Progress,
 ) -> list[Tried]:
     """Other effects in the place of each of several that explain the data together.
@@ -332,7 +353,8 @@ def in_their_places(
     Where what remains without an effect is gross, that effect had its contest as a single one, and
     beside the others only those `at_the_same_place` are near. One effect in the place of them all
     is sought too, from what they say of the declared model.
-    `extended` are the sets (of keys, sorted) that have been grown from already.
+    `extended` are the sets (of keys, sorted) that have been grown from already, with the misfit
+    that they had there.
     """
     good = [t for t in tries if t.explains and t.spread is None]
     if not good:
@@ -343,11 +365,11 @@ def in_their_places(
     already = {e.key for e in best.effects}
     out: list[Tried] = []
     for kept in [*combinations(best.effects, len(best.effects) - 1), ()]:
-        if kept and key_of_forms(kept) in extended:
-            continue
         base = with_fewer(best, kept, data) if kept else part_of(best, (), data)
         if not np.isfinite(base.chi2) or (kept and base.chi2_per_dof > GROSS):
             continue  # no place to start from
+        if kept and extended.get(key_of_forms(kept), np.inf) < 2 * base.chi2:
+            continue  # what stands beside it from about there has been seen
         names = {e.name for e in kept}
         out += try_effects(
             base.structure, data, base,

@@ -131,7 +131,7 @@ class _Searching:
     fuller: tuple[Effect, ...]  # forms for one mode more, beside an effect that brings it
     scatters: tuple[Scatter, ...]
     tried: list[Tried] = field(default_factory=list)
-    extended: set[tuple[str, ...]] = field(default_factory=lambda: {()})  # keys: grown from …
+    extended: dict[tuple[str, ...], float] = field(default_factory=dict)  # grown from, χ² there …
     done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
 
     @property
@@ -186,7 +186,7 @@ class _Searching:
         )  # fmt: skip
         pairs = self._led_to_the_end(pairs)
         # all that may stand beside one of them has been sought beside it already
-        self.extended.update((e.key,) for t in pairs if t.explains for e in t.effects)
+        self.extended |= {(e.key,): 0.0 for t in pairs if t.explains for e in t.effects}
         self.tried += [eliminate(t, self.data) if t.explains else t for t in pairs]
         return pairs
 
@@ -195,7 +195,7 @@ class _Searching:
         grown: list[Tried] = []
         far = self.base.chi2_per_dof > GROSS and not self.explained
         for parent in parents:
-            self.extended.add(parent.key_of_forms)
+            self.extended[parent.key_of_forms] = parent.fit.chi2
             rest = [
                 e
                 for e in (*self.apart, *self.fuller)
@@ -323,8 +323,9 @@ def _a_place_to_grow_from(singles: Sequence[Tried]) -> bool:
 
 
 def _least(tries: Sequence[Tried]) -> float:
-    """χ²/dof of the best of them; 0 of none."""
-    return min((t.fit.chi2_per_dof for t in tries), default=0.0)
+    """χ²/dof of the best of them that may be true; 0 of none."""
+    likely = (t.fit.chi2_per_dof for t in tries if t.plausible)
+    return min(likely, default=np.inf if tries else 0.0)
 
 
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:

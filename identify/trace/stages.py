@@ -244,7 +244,7 @@ def canonical(fit: Fit, data: Dataset) -> Fit:
     structure = fit.structure
     plain = replace(structure, effects=())
     for effect in structure.effects:
-        if not fit.converged or effect.restated(plain) is None:
+        if effect.restated(plain) is None:
             continue
         p = {**fit.values, **effect.to_restated(plain, fit.values)}
         theta = by_name(effect, structure, p)
@@ -252,7 +252,7 @@ def canonical(fit: Fit, data: Dataset) -> Fit:
             continue
         renamed = fit_orbits(structure, data, theta, continuation=(0.0,))
         # beside an effect that speaks of the modes by number, another name is another model
-        if renamed.converged and renamed.chi2 < fit.chi2 + 1.0:
+        if renamed.converged >= fit.converged and renamed.chi2 < fit.chi2 + 1.0:
             fit = renamed
     return fit
 
