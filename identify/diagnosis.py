@@ -250,6 +250,14 @@ def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float
     return value if np.isfinite(value) else None
 
 
+def _not_contradicted(fit: Fit) -> str:
+    said, p = "The declared model explains the data to within noise.", fit.theta.size
+    if fit.dof >= p:
+        return said
+    left = f"{fit.dof} degree{'' if fit.dof == 1 else 's'} of freedom beside its {p} parameters"
+    return f"{said} That says little: the usable runs leave {left}. Record more of them."
+
+
 def _judge(
     declared: _Declared,
     tried: Sequence[Tried],
@@ -259,7 +267,7 @@ def _judge(
     """Verdict, the candidate it rests on, and the reason in words; `pieces` are freely shaped, and
     what is far less likely than one of them is not claimed."""
     if not declared.significant:
-        return "no_discrepancy", None, "The declared model explains the data to within noise."
+        return "no_discrepancy", None, _not_contradicted(declared.fit)
     good = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
     good = [t for t in good if not trace.outdone(t, pieces)]
     if good:

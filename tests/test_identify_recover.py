@@ -14,6 +14,7 @@ from identify.identification import prepare
 from identify.load import load_campaign
 from identify.record import Campaign, Medium, Run, Signal
 from identify.start import fit_declared, fit_from_data
+from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.identify_rig import true_values, velocity
@@ -90,6 +91,16 @@ def test_clean_data_show_no_discrepancy() -> None:
     diagnosis = identify.diagnose(campaign(noise=3e-4, seed=5))
     assert diagnosis.verdict == "no_discrepancy"
     assert diagnosis.effects == ()
+
+
+@pytest.mark.parametrize(("forced", "says_little"), [(1, True), (4, False)])
+def test_few_data_say_little(forced: int, says_little: bool, tmp_path: Path) -> None:
+    """What fits as many unknowns as there are data has not been tested by them."""
+    rig, plan = random_campaign(7, build_config(noise_db=36.0), (), forced=forced, validation=0)
+    write_campaign(simulate_campaign(rig, plan, 7, declared_modes=2), tmp_path)
+    diagnosis = identify.diagnose(load_campaign(open_campaign(tmp_path)))
+    assert diagnosis.verdict == "no_discrepancy"
+    assert ("That says little" in diagnosis.explanation) is says_little
 
 
 def test_fourier_coefficients_of_an_incomplete_period() -> None:

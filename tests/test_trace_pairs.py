@@ -9,7 +9,8 @@ import pytest
 from identify import start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
-from identify.structure import Structure
+from identify.structure import MODAL, Structure
+from identify.trace.contests import with_fewer
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from tests.trace_material import fitted, search_for, thesis_campaign, tried_as
 
@@ -143,6 +144,38 @@ def test_what_has_been_stopped_at_the_edge_of_its_range_is_not_plausible() -> No
     assert not damping.plausible(np.exp(np.log(damping.lower)))
     coefficient = by_key("nonlinear_damping:cubic").parameters[0]
     assert coefficient.plausible(0.0)  # a signed one may end there of itself
+
+
+def test_of_the_modes_any_may_be_the_one_too_many(tmp_path: Path) -> None:
+    """Left out is the mode that is not there, under whatever name the descent came to it."""
+    ready = thesis_campaign(tmp_path, 5, {})
+    base = start.fit_from_data(ready.structure, ready.data)
+    mode = by_key("acoustic_mode:mode")
+    larger, v = ready.structure.with_effects(mode), base.values
+    values = v | {f"acoustic_mode.{k}": v[f"mode2.{k}"] for k in MODAL}
+    values |= dict(zip((f"mode2.{k}" for k in MODAL), (1700.0, 1e-3, 0.1, 0.1), strict=True))
+    theta = larger.parameters.to_internal([values[n] for n in larger.parameters.names])
+    swapped = tried_as(replace(base, structure=larger, theta=theta), mode.key)
+    without = with_fewer(swapped, (), ready.data)
+    assert without.chi2 == pytest.approx(base.chi2, rel=1e-3)
+
+
+def test_without_the_flame_s_part_nothing_sings() -> None:
+    """A set in which the singing mode's flame residue is not seen explains nothing."""
+    mode = by_key("acoustic_mode:mode")
+    structure = Structure(2).with_effects(mode)
+    values = {q.name: 1.0 for q in structure.parameters.parameters}
+    values |= {"mode1.damping": 0.01, "mode2.damping": 0.05, "acoustic_mode.damping": 0.04}
+    values |= {"acoustic_mode.frequency_hz": 400.0, "mode1.flame_residue": 30.0}
+    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+    at = structure.parameters.index["mode1.flame_residue"]
+    for stderr, sings in ((3.0, True), (40.0, False)):
+        covariance = np.zeros((theta.size, theta.size))
+        covariance[at, at] = stderr**2
+        fit = replace(
+            fitted(theta.size, 1.0), structure=structure, theta=theta, covariance=covariance
+        )
+        assert tried_as(fit, mode.key).plausible is sings
 
 
 def test_a_further_mode_must_be_somewhere() -> None:

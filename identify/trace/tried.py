@@ -110,7 +110,7 @@ class Tried:
         inside = all(q.plausible(values[q.name]) for e in self.effects for q in e.parameters)
         # without the flame's part in the mode that sings, nothing makes it sing
         located = ["mode1.flame_residue", *(n for e in self.effects for n in e.located)]
-        seen = all(known[n].stderr < abs(values[n]) for n in located)
+        seen = all(known[n].stderr <= abs(values[n]) for n in located)
         modes = range(1, self.fit.structure.mode_count + 1)
         return inside and seen and all(values[f"mode{i}.damping"] < 0.7 for i in modes)
 
