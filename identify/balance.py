@@ -25,7 +25,15 @@ from identify import dual
 from identify.dual import Dual
 from identify.newton import newton, slopes
 from identify.polynomial import Polynomial
-from identify.structure import Characteristic, Conditions, Loop, Preceded, Structure, Values
+from identify.structure import (
+    Characteristic,
+    Conditions,
+    Loop,
+    Preceded,
+    Structure,
+    Values,
+    at_the_flame,
+)
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -159,10 +167,12 @@ def differentiate(
 
 def _inputs_from_velocity(structure: Structure, values: Values, at: Conditions) -> ComplexArray:
     """Nonlinearity inputs implied by the measured velocity: the start on the measured branch."""
-    k = np.arange(1, at.harmonics + 1)
-    H = structure.flame_path(values, at, 1j * at.omega[:, None] * k)
-    w = np.asarray(H * at.velocity, dtype=complex)
-    return np.stack([w] + [at.velocity] * (structure.loops(values, at) - 1))
+    s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
+    with np.errstate(all="ignore"):
+        y = at_the_flame(structure.effects, values, at, s)
+        y = np.where(np.isfinite(y), y, at.velocity)
+        w = np.asarray(structure.flame_path(values, at, s) * y, dtype=complex)
+    return np.stack([w] + [y] * (structure.loops(values, at) - 1))
 
 
 def _newton(

@@ -35,7 +35,7 @@ from identify.fit import (
     levenberg_marquardt,
     soften,
 )
-from identify.structure import Effect, Mode, Structure, Values
+from identify.structure import Effect, Mode, Structure, Values, at_the_flame
 from identify.thesis.rows import regressors
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -275,20 +275,16 @@ def _near(structure: Structure, a: FloatArray, b: FloatArray) -> bool:
 
 def corrected(data: Dataset, effects: Sequence[Effect], p: Values) -> Dataset | None:
     """The data as they would be without `effects` of assumed values `p`, as far as these stand
-    between the recorded drive and the sound, or between the velocity and its measurement. What
-    effects form from measured signals is in the measurement's own phase, in free runs too.
+    between the recorded drive and the sound, or between the velocity and its measurement.
 
     None where the values are so extreme that nothing finite is left.
     """
 
     def clean(b: Batch) -> Batch:
         s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
-        drive, y = b.at.drive, b.at.velocity
-        given = replace(b.at, free=np.zeros_like(b.at.free))
+        drive, y = b.at.drive, at_the_flame(effects, p, b.at, s)
         for e in effects:
             drive = e.actuator(p, b.at, s) * e.drive(p, b.at, drive)
-            none = e.sensor(p, given, s, np.zeros_like(y))
-            y = (y - none) / (e.sensor(p, given, s, np.ones_like(y)) - none)
         at = replace(b.at, drive=np.broadcast_to(drive, y.shape), velocity=y)
         return replace(b, at=at, measured=y[:, : b.compared])
 
@@ -326,11 +322,10 @@ def slow_flow(data: Dataset, effects: Sequence[Effect] = (), p: Values | None = 
     phase = 1.0 + 0j
     for b in data.fit:
         s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
-        drive, y = b.at.drive, b.at.velocity
+        drive, y = b.at.drive, at_the_flame(effects, p, b.at, s)
         modes = [Mode(1.0, 1.0, 1.0, 1.0)]
         for e in effects:
             drive = e.actuator(p, b.at, s) * e.drive(p, b.at, drive)
-            y = 2 * y - e.sensor(p, b.at, s, y)
             modes = e.modes(p, b.at, modes)
         shift = np.broadcast_to(np.asarray(modes[0].frequency_hz, dtype=float), (b.runs, 1))[:, 0]
         Y, U = y[:, 0], np.broadcast_to(drive, y.shape)[:, 0]

@@ -489,6 +489,17 @@ def _lagrange_coefficients(nodes: Sequence[float], values: Sequence[Any]) -> lis
     return [_sum(matrix[d, j] * excess[j] for j in range(x.size)) for d in range(x.size)]
 
 
+def at_the_flame(effects: Sequence[Effect], p: Values, at: Conditions, s: Any) -> ComplexArray:
+    """The measured velocity as it is at the flame, without what `effects` put between them. What
+    they form from measured signals is in the measurement's own phase, in free runs too."""
+    given, y = replace(at, free=np.zeros_like(at.free)), at.velocity
+    for e in reversed(effects):
+        if type(e).sensor is not Effect.sensor:
+            none = e.sensor(p, given, s, np.zeros_like(y))
+            y = (y - none) / (e.sensor(p, given, s, np.ones_like(y)) - none)
+    return y
+
+
 def declared_modes(p: Values, count: int) -> list[Mode]:
     """The first `count` modes, without effects."""
     return [Mode(*(p[f"mode{i}.{n}"] for n in MODAL)) for i in range(1, count + 1)]

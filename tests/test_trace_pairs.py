@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identify import start, trace
+from identify import balance, start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.structure import MODAL, Structure
@@ -135,6 +135,17 @@ def test_a_free_run_is_corrected_for_its_microphones(
     before = start.fit_from_data(ready.structure, ready.data)
     after = start.fit_from_data(ready.structure, clean)
     assert after.chi2_per_dof < 1.5 < before.chi2_per_dof
+
+
+def test_orbits_are_sought_from_the_velocity_at_the_flame(tmp_path: Path) -> None:
+    """A gross mismatch makes most of what is measured: from there, the orbits would be missed."""
+    clean = thesis_campaign(tmp_path / "clean", 5, {}, noise_db=60.0)
+    truth = start.fit_from_data(clean.structure, clean.data).theta
+    ready = thesis_campaign(tmp_path / "gross", 5, {"channel_mismatch": {"gain": -0.04}}, 60.0)
+    mismatch = by_key("channel_mismatch:gain")
+    theta = np.r_[truth, mismatch.to_internal((-0.04,))]
+    for b in ready.data.fit:
+        assert balance.solve(ready.structure.with_effects(mismatch), theta, b.at).converged.all()
 
 
 def test_what_has_been_stopped_at_the_edge_of_its_range_is_not_plausible() -> None:
