@@ -320,6 +320,15 @@ def test_a_multiple_of_the_mains_is_believed_where_one_run_shows_it() -> None:
     assert ("180Hz", (1,)) in spoilt
 
 
+@pytest.mark.parametrize(("frequency", "believed"), [(50.0, True), (60.0, True), (57.3, False)])
+def test_faint_hum_is_believed_where_another_tone_would_not_be(
+    clean: Campaign, frequency: float, believed: bool
+) -> None:
+    """No run shows it by itself; at a frequency of the mains, most runs together do."""
+    found = inspect(edited(clean, line(frequency, 0.26)))
+    assert [round(t.frequency_hz) for t in found.tones] == ([frequency] if believed else [])
+
+
 def test_a_tone_in_one_run_is_no_interference(clean: Campaign) -> None:
     found, flags, _ = judged(clean, line(433.3, 2.0))
     assert flags == {"foreign_tone": "noted"}

@@ -7,9 +7,10 @@ elsewhere in every run: where such scattered peaks surround it, a line is not be
 What the free cycle and the drive combine to moves with the drive, and a line among all that, where
 no single run could tell it apart, is foreign where runs at several forcings have it at one place.
 
-A line of the mains brings its multiples. One of those is believed wherever the rig's own lines
-leave it to be seen, be it in a single run: forced at three times 50 Hz, no run shows what it takes
-for its own.
+Hum is so usual that it is believed where most runs have a little of it, though none would show it
+by itself. A line of the mains brings its multiples. One of those is believed wherever the rig's own
+lines leave it to be seen, be it in a single run: forced at three times 50 Hz, no run shows what it
+takes for its own.
 """
 
 from collections.abc import Sequence
@@ -31,6 +32,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ALONE = 100.0  # power over noise of a line that is named though no other run has it
 PURE = 4.0  # power over that of the bins beside it, of a line; of one found alone twice that
+PURE_MEAN = 2.0  # the same on an average of runs, of a line where the mains have one
 PURE_KNOWN = 1.0  # where other runs have a line: what the chance PRESENT stands for
 PRESENT = 1e-3  # chance below which a known tone counts as present in a run
 ALPHA = 1e-6  # chance of a tone among noise, all runs and bins considered
@@ -96,12 +98,24 @@ def tones(
 ) -> tuple[tuple[Tone, ...], list[QualityFlag]]:
     """Tones common to most runs, and flags of every run's foreign lines."""
     searched = [lines(v, free) for v in views]
-    found = [p for i, s in enumerate(searched) for p in peaks(s, i)]
-    if not found:
+    if not searched:
         return (), []
+    found = [p for i, s in enumerate(searched) for p in peaks(s, i)]
     width = float(np.median([v.bin_hz for v in views]))
     out: list[Tone] = []
     flags: list[QualityFlag] = []
+
+    def believed(where: Sequence[Lines], frequencies: Sequence[float]) -> None:
+        for frequency in frequencies:
+            if any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out):
+                continue
+            seen = seen_at(where, frequency)
+            present = present_in(seen)
+            tone = common(frequency, seen, present) if present else None
+            if tone is not None:
+                out.append(tone)
+                flags.extend(line_flag(s, frequency, True) for s in present)
+
     for place in places(found, width):
         seen = seen_at(searched, place.frequency_hz)
         present = present_in(seen)
@@ -118,16 +132,9 @@ def tones(
             for p in alone
         ]
     bare = [lines(v, free, combinations=False) for v in views]
-    credible = [(searched, f) for f in multiples(out)] + [(bare, f) for f in constant(bare, width)]
-    for where, frequency in credible:
-        if any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out):
-            continue
-        seen = seen_at(where, frequency)
-        present = present_in(seen)
-        tone = common(frequency, seen, present) if present else None
-        if tone is not None:
-            out.append(tone)
-            flags += [line_flag(s, frequency, True) for s in present]
+    believed(searched, hum(searched, found, width))
+    believed(searched, multiples(out))
+    believed(bare, constant(bare, width))
     return tuple(out), flags
 
 
@@ -162,6 +169,17 @@ def constant(searched: Sequence[Lines], width_hz: float) -> list[float]:
         forced = {searched[i].view.frequency_hz for i in place.runs}
         if len(forced) >= DIFFERENT and 4 * place.around <= len(place.runs):
             out.append(place.frequency_hz)
+    return out
+
+
+def hum(searched: Sequence[Lines], found: Sequence[Peak], width_hz: float) -> list[float]:
+    """The mains' frequencies, where most runs have a line too faint to be named in any of them."""
+    out = []
+    for mains in MAINS_HZ:
+        purity = [s.where.purity(s.bin) for s in present_in(seen_at(searched, mains))]
+        alone = scattered(found, mains, width_hz) == 0
+        if len(purity) > 1 and alone and float(np.mean(purity)) > PURE_MEAN:
+            out.append(mains)
     return out
 
 
