@@ -171,37 +171,36 @@ def test_of_the_modes_any_may_be_the_one_too_many(tmp_path: Path) -> None:
     assert without.chi2 == pytest.approx(base.chi2, rel=1e-3)
 
 
-def test_without_the_flame_s_part_nothing_sings() -> None:
-    """A set in which the singing mode's flame residue is not seen explains nothing."""
+def a_further_mode(name: str, internal_stderr: float, **own: float) -> trace.Tried:
+    """One more mode that explains the data, of its values only `name` known to within that."""
     mode = by_key("acoustic_mode:mode")
     structure = Structure(2).with_effects(mode)
     values = {q.name: 1.0 for q in structure.parameters.parameters}
-    values |= {"mode1.damping": 0.01, "mode2.damping": 0.05, "acoustic_mode.damping": 0.04}
-    values |= {"acoustic_mode.frequency_hz": 400.0, "mode1.flame_residue": 30.0}
+    values |= {"mode1.damping": 0.01, "mode2.damping": 0.05, "mode1.flame_residue": 30.0}
+    values |= {"acoustic_mode.damping": 0.04, "acoustic_mode.frequency_hz": 400.0}
+    values |= {f"acoustic_mode.{key}": x for key, x in own.items()}
     theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
-    at = structure.parameters.index["mode1.flame_residue"]
-    for stderr, sings in ((3.0, True), (40.0, False)):
-        covariance = np.zeros((theta.size, theta.size))
-        covariance[at, at] = stderr**2
-        fit = replace(
-            fitted(theta.size, 1.0), structure=structure, theta=theta, covariance=covariance
-        )
-        assert tried_as(fit, mode.key).plausible is sings
+    covariance = np.zeros((theta.size, theta.size))
+    at = structure.parameters.index[name]
+    covariance[at, at] = internal_stderr**2
+    fit = replace(fitted(theta.size, 1.0), structure=structure, theta=theta, covariance=covariance)
+    return tried_as(fit, mode.key)
+
+
+def test_without_the_flame_s_part_nothing_sings() -> None:
+    """A set in which the singing mode's flame residue is not seen explains nothing."""
+    assert a_further_mode("mode1.flame_residue", 3.0).plausible
+    assert not a_further_mode("mode1.flame_residue", 40.0).plausible
+
+
+def test_what_nobody_knows_has_been_stopped_by_nothing() -> None:
+    """A damping at the edge of its range is told from one inside, or else is no objection."""
+    lowest = by_key("acoustic_mode:mode").parameters[1].lower
+    assert not a_further_mode("acoustic_mode.damping", 0.3, damping=lowest).plausible
+    assert a_further_mode("acoustic_mode.damping", 25.0, damping=lowest).plausible
 
 
 def test_a_further_mode_must_be_somewhere() -> None:
     """Of a frequency that the data do not know to within its own size nothing has been seen."""
-    mode = by_key("acoustic_mode:mode")
-    structure = Structure(2).with_effects(mode)
-    values = {q.name: 1.0 for q in structure.parameters.parameters}
-    values |= {"mode1.damping": 0.01, "mode2.damping": 0.05, "acoustic_mode.damping": 0.04}
-    values |= {"acoustic_mode.frequency_hz": 400.0}
-    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
-    at = structure.parameters.index["acoustic_mode.frequency_hz"]
-    for relative, seen in ((0.3, True), (4.0, False)):
-        covariance = np.zeros((theta.size, theta.size))
-        covariance[at, at] = relative**2  # of the logarithm
-        fit = replace(
-            fitted(theta.size, 1.0), structure=structure, theta=theta, covariance=covariance
-        )
-        assert tried_as(fit, mode.key).plausible is seen
+    assert a_further_mode("acoustic_mode.frequency_hz", 0.3).plausible
+    assert not a_further_mode("acoustic_mode.frequency_hz", 4.0).plausible

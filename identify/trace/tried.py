@@ -107,7 +107,12 @@ class Tried:
             return False
         known = self.estimates
         values = {name: e.value for name, e in known.items()}
-        inside = all(q.plausible(values[q.name]) for e in self.effects for q in e.parameters)
+        own = [q for e in self.effects for q in e.parameters]
+        # where the data do not know it to within a factor, an edge has stopped nothing
+        open_ = {
+            q.name for q in own if q.kind == "positive" and known[q.name].stderr > values[q.name]
+        }
+        inside = all(q.plausible(values[q.name]) or q.name in open_ for q in own)
         # without the flame's part in the mode that sings, nothing makes it sing
         located = ["mode1.flame_residue", *(n for e in self.effects for n in e.located)]
         seen = all(known[n].stderr <= abs(values[n]) for n in located)
