@@ -48,6 +48,7 @@ DISTANT = 40  # of those from the slow flow, of either sign, where the declared 
 NEARLY = 100.0  # χ²/dof beyond which the model is to blame, not a mode at the wrong place
 WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_weak_pulls`
 LONG = 600  # iterations that lead on what comes nearest and has not converged
+DAMPED = (3e-4, 0.5)  # damping ratios between which a mode is one
 REFUSED = 1e-3  # chance of held-out runs below which another minimum is sought that suits them too
 FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
@@ -563,8 +564,8 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
     A start of the polynomial balance that reaches the noise (χ² within five standard deviations
     of its expectation) settles it. Otherwise all kinds of start are led in side by side: those of
     the polynomial balance, exact where the model is, and of the slow flow, robust where it is not.
-    Where that ends near the noise but not at it, or the runs are few, the other modes are placed
-    more densely.
+    Where that ends near the noise but not at it, or the runs are few, or a mode has strayed, the
+    other modes are placed more densely.
     """
     starts = coarse(structure, data, candidates(structure, data))
     for start in starts[:1]:  # the polynomial balance is exact where the model is: try it first
@@ -579,7 +580,7 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
         return failed(structure, data, np.zeros(p), "no start exists for these data")
     thetas = np.stack([s.theta for s in polished[:4]])
     fit = fit_orbits(structure, data, thetas, continuation=(0.003, 0.0), iterations=120)
-    hopeless = fit.chi2_per_dof > NEARLY and fit.dof >= FEW * fit.theta.size
+    hopeless = fit.chi2_per_dof > NEARLY and fit.dof >= FEW * fit.theta.size and not _strayed(fit)
     if structure.mode_count < 2 or _adequate(fit) or hopeless:
         return fit
     found = [fit, *_replaced(structure, data, rough, fit)]
@@ -604,6 +605,13 @@ def fit_declared(structure: Structure, data: Dataset) -> Fit:
         return fit
     other = fit_orbits(structure, data, whole.theta, continuation=(0.0,))
     return other if other.chi2 < _noise(other.dof) and not _refused(other, data) else fit
+
+
+def _strayed(fit: Fit) -> bool:
+    """Whether a mode has gone where none is: hardly damped at all, or hardly ringing."""
+    modes = range(1, fit.structure.mode_count + 1)
+    dampings = [fit.values[f"mode{i}.damping"] for i in modes]
+    return not all(DAMPED[0] < zeta < DAMPED[1] for zeta in dampings)
 
 
 def _refused(fit: Fit, data: Dataset) -> bool:

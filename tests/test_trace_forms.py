@@ -12,7 +12,7 @@ from scipy import stats
 
 from daq.importers import open_campaign
 from identify import dual, start, trace
-from identify.effects import by_key
+from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.identification import Prepared, prepare
@@ -163,6 +163,19 @@ def test_two_further_modes_beside_another_effect(tmp_path: Path) -> None:
     assert rivals == []
     found = best.estimates["channel_mismatch.gain"]
     assert abs(found.value - 0.01) < 4 * found.stderr
+
+
+def test_two_laws_of_loss_at_once(tmp_path: Path) -> None:
+    """Their sum is sought from where one of them has come."""
+    laws = [("quadratic", {"quadratic_per_m": 3.0}), ("cubic", {"cubic_s_per_m2": 20.0})]
+    effects = [(f"nonlinear_damping/{law}", size) for law, size in laws]
+    ready = thesis_campaign(tmp_path, 4, effects, noise_db=60.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    losses = [e for e in CATALOGUE if e.name == "nonlinear_damping"]
+    found = trace.search(ready.structure, ready.data, base, catalogue=losses)
+    best = trace.best_form([t for t in found.tried if t.explains])
+    assert best.key_of_forms == ("nonlinear_damping:quadratic_cubic_end",)
+    assert not any(t.explains for t in found.tried if "quadratic_cubic" not in t.effects[0].form)
 
 
 def test_other_effects_at_the_same_place_start_from_where_one_explains(tmp_path: Path) -> None:

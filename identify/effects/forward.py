@@ -165,50 +165,68 @@ class SideResonator(Effect):
         )
 
 
+LOSSES = {"quadratic": (2, "1/m"), "cubic": (3, "s/m²")}  # power of the velocity, unit
+
+
 class NonlinearDamping(Effect):
     """Amplitude-dependent acoustic loss β |v|^(n−1) v, as by vortices shed at the open end.
 
-    ``quadratic`` and ``cubic`` are of the flame's velocity and act on all modes alike; with
-    ``_mode`` of the singing mode's part, and on that mode alone: its damping grows. With ``_end``
-    the velocity is that of another place, where the modes meet in other proportions, v = Σ q_i y_i,
-    and act back on mode i by g_i β: q_1 = g_1 = 1.
+    ``quadratic``, ``cubic`` and, from where one of these has come, ``quadratic_cubic``, their sum,
+    are of the flame's velocity and act on all modes alike; with ``_mode`` of the singing mode's
+    part, and on that mode alone: its damping grows. With ``_end`` the velocity is that of another
+    place, where the modes meet in other proportions, v = Σ q_i y_i, and they act back on mode i by
+    g_i β: q_1 = g_1 = 1.
     """
 
     name, location = "nonlinear_damping", "forward"
 
     def __init__(self, form: str, modes: int | None = None) -> None:
         self.form, self.mode_count = form, modes
-        self.power = 2 if form.startswith("quadratic") else 3
+        self.laws = [law for law in LOSSES if law in form]
+        self.refines = len(self.laws) > 1
         self.mode_only = form.endswith("_mode")
-        unit = "1/m" if self.power == 2 else "s/m²"
-        self.parameters = (
-            Parameter("nonlinear_damping.coefficient", unit, 0.0),
-            *(
-                Parameter(f"nonlinear_damping.{word}_ratio{i}", "1", -20.0, 20.0)
-                for i in range(2, (modes or 1) + 1)
-                for word in ("end", "return")
-            ),
+        self.own = tuple(
+            Parameter(f"nonlinear_damping.{law if self.refines else 'coefficient'}", unit, 0.0)
+            for law, (_, unit) in LOSSES.items()
+            if law in self.laws
         )
+        self.ratios = tuple(
+            Parameter(f"nonlinear_damping.{word}_ratio{i}", "1", -20.0, 20.0)
+            for i in range(2, (modes or 1) + 1)
+            for word in ("end", "return")
+        )
+        self.parameters = (*self.own, *self.ratios)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         # a share of the linear loss 2ζω at the amplitude of the forced runs
-        loss = 4 * 3.14159 * known.modes_damping[0] * known.modes_hz[0]
-        size = 0.2 * loss / known.velocity_amplitude ** (self.power - 1)
-        signs = product((-1.0, 1.0), repeat=len(self.parameters) // 2)
-        return [(size, *np.repeat(q, 2).tolist()) for q in signs]
+        loss = 0.2 * 4 * 3.14159 * known.modes_damping[0] * known.modes_hz[0]
+        sizes = [loss / known.velocity_amplitude ** (LOSSES[law][0] - 1) for law in self.laws]
+        signs = product((-1.0, 1.0), repeat=len(self.ratios) // 2)
+        return [(*sizes, *np.repeat(q, 2).tolist()) for q in signs]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """The sum starts from either law, wherever that acts."""
+        if not self.refines:
+            return super().starts_from(other, values)
+        known = {q.unit: values[q.name] for q in other.parameters if q.unit != "1"}
+        sizes = [known.get(q.unit, 0.0) for q in self.own]
+        return [(*sizes, *(values.get(q.name, 1.0) for q in self.ratios))]
 
     def neutral(self) -> tuple[float, ...]:
-        return (0.0, *(1.0,) * (len(self.parameters) - 1))
+        return (*(0.0 for _ in self.own), *(1.0 for _ in self.ratios))
 
     def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss:
-        beta = p["nonlinear_damping.coefficient"]
-        cubic = self.power == 3
-        characteristic = Polynomial((0.0, 0.0, 1.0)) if cubic else Polynomial((0.0,), bent=1.0)
+        beta: Any = p[self.own[0].name]
+        characteristic = Polynomial((0.0, 0.0, 1.0))
+        if self.refines:
+            beta, characteristic = 1.0, Polynomial((0.0, 0.0, p[self.own[1].name]), bent=beta)
+        elif "quadratic" in self.laws:
+            characteristic = Polynomial((0.0,), bent=1.0)
         count = len(modes)
         if self.mode_count is not None:
             ones = [1.0] * count  # modes of another effect come after its own
-            q: list[Any] = [1.0, *(p[n.name] for n in self.parameters[1::2]), *ones][:count]
-            g: list[Any] = [1.0, *(p[n.name] for n in self.parameters[2::2]), *ones][:count]
+            q: list[Any] = [1.0, *(p[n.name] for n in self.ratios[0::2]), *ones][:count]
+            g: list[Any] = [1.0, *(p[n.name] for n in self.ratios[1::2]), *ones][:count]
             return Loss([beta * x for x in g], characteristic, q)
         if self.mode_only:
             others = [0.0] * (count - 1)
@@ -224,5 +242,8 @@ EFFECTS: tuple[Effect, ...] = (
     NonlinearDamping("quadratic_mode"),
     NonlinearDamping("cubic"),
     NonlinearDamping("cubic_mode"),
-    *(NonlinearDamping(f"{law}_end", n) for law in ("quadratic", "cubic") for n in (2, 3)),
+    *(NonlinearDamping(f"{law}_end", n) for law in LOSSES for n in (2, 3)),
+    NonlinearDamping("quadratic_cubic"),
+    NonlinearDamping("quadratic_cubic_mode"),
+    *(NonlinearDamping("quadratic_cubic_end", n) for n in (2, 3)),
 )

@@ -102,7 +102,7 @@ def search(
         parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
-        nowhere = size == 2 and not _a_place_to_grow_from(singles)
+        nowhere = size == 2 and not _a_place_to_grow_from(singles, base)
         found = going.pairs(singles) if nowhere else going.grown(parents)
         if size == 2:
             going.with_chance(parents)
@@ -315,11 +315,14 @@ class _Searching:
         self.tried += settled(self.tried, data, run)
 
 
-def _a_place_to_grow_from(singles: Sequence[Tried]) -> bool:
-    """Whether the best single leaves little, or so much less than any other that it is surely part
-    of the matter."""
+def _a_place_to_grow_from(singles: Sequence[Tried], base: Fit) -> bool:
+    """Whether the best single leaves little, or so much less than any other, or than there is
+    without it, that it is surely part of the matter."""
     best = [t.fit.chi2_per_dof for t in best_by_name(singles)]
-    return bool(best) and (best[0] <= GROSS or STANDS_OUT * best[0] < min([*best[1:], np.inf]))
+    if not best:
+        return False
+    others = min([*best[1:], np.inf])
+    return best[0] <= GROSS or STANDS_OUT * best[0] < max(others, base.chi2_per_dof / STANDS_OUT)
 
 
 def _least(tries: Sequence[Tried]) -> float:
