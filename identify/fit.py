@@ -35,6 +35,9 @@ IntArray = npt.NDArray[np.int64]
 
 LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
 HOPE = 20  # iterations for what may be given up as hopeless
+VALLEY = 8  # iterations after which a descent is taken to follow one
+PROBE = 0.3  # of a step, where its curvature is looked at
+BENT = 0.4  # of the step that the bend may be
 
 
 @dataclass(frozen=True)
@@ -371,6 +374,7 @@ class _Factors:
     gradient: FloatArray
     values: FloatArray
     Vt: FloatArray
+    U: FloatArray
     along: FloatArray  # Uᵀ ρ
 
     @property
@@ -383,6 +387,14 @@ class _Factors:
         step = -(self.Vt.T @ (self.values / (self.values**2 + damping) * self.along))
         slope = 2 * self.gradient + self.jacobian.T @ (self.jacobian @ step)
         return step / self.scale, -float(step @ slope)
+
+    def bend(self, damping: float, step: FloatArray, curvature: FloatArray) -> FloatArray:
+        """What the second order adds to a step along which the residuals curve so, in unscaled
+        unknowns; none where it would be no correction any more."""
+        along = self.values / (self.values**2 + damping) * (self.U.T @ curvature)
+        bend = -0.5 * (self.Vt.T @ along)
+        small = np.linalg.norm(bend) < BENT * np.linalg.norm(step * self.scale)
+        return np.asarray(bend / self.scale if small else np.zeros_like(bend))
 
 
 @dataclass
@@ -453,8 +465,9 @@ def levenberg_marquardt(
                 steps.append(step)
         if not trials:
             break
-        moved = np.stack([trial for trial, _ in steps])
         which = np.array([n for n, _ in trials])
+        moved = np.stack([s.theta for _, s in trials]) + _bent(function, trials, steps)
+        moved = np.clip(moved, low[which], high[which])
         outcome = function(moved, which, False)
         accepted = []
         for m, ((_, s), (_, predicted)) in enumerate(zip(trials, steps, strict=True)):
@@ -496,7 +509,7 @@ def _propose(
     iterations: int,
     patience: int,
 ) -> tuple[FloatArray, float] | None:
-    """The next trial of a descent and its predicted decrease, or None where it has ended."""
+    """The next step of a descent and its predicted decrease, or None where it has ended."""
     if s.refused == 0:
         s.iterations += 1
         s.factors = _factors(s, low, high)
@@ -514,7 +527,30 @@ def _propose(
         s.ended = f"not converged in {iterations} iterations"
         return None
     step, predicted = s.factors.step(s.damping)
-    return np.clip(s.theta + step, low, high), predicted
+    return np.clip(s.theta + step, low, high) - s.theta, predicted
+
+
+def _bent(
+    function: Residual,
+    trials: Sequence[tuple[int, _State]],
+    steps: Sequence[tuple[FloatArray, float]],
+) -> FloatArray:
+    """The steps, in long descents bent by the second order as valleys are (geodesic acceleration,
+    Transtrum & Sethna 2012): its derivative along a step costs one more residual."""
+    out = np.stack([step for step, _ in steps])
+    far = [m for m, (_, s) in enumerate(trials) if s.iterations > VALLEY]
+    if not far:
+        return out
+    nearer = np.stack([trials[m][1].theta + PROBE * out[m] for m in far])
+    probe = function(nearer, np.array([trials[m][0] for m in far]), False)
+    for row, m in enumerate(far):
+        s = trials[m][1]
+        assert s.factors is not None
+        if probe.exists[row]:
+            straight = s.factors.jacobian @ (out[m] * s.factors.scale)
+            curvature = 2 / PROBE * ((probe.residual[row] - s.residual) / PROBE - straight)
+            out[m] += s.factors.bend(s.damping, out[m], curvature)
+    return out
 
 
 def _factors(s: _State, low: FloatArray, high: FloatArray) -> _Factors:
@@ -526,7 +562,7 @@ def _factors(s: _State, low: FloatArray, high: FloatArray) -> _Factors:
     held = ((s.theta <= low) & (g > 0)) | ((s.theta >= high) & (g < 0))
     J, g = np.where(held, 0.0, J), np.where(held, 0.0, g)
     U, sv, Vt = np.linalg.svd(J, full_matrices=False)
-    return _Factors(scale, J, g, sv, Vt, U.T @ s.residual)
+    return _Factors(scale, J, g, sv, Vt, U, U.T @ s.residual)
 
 
 def covariance_of(jacobian: FloatArray) -> FloatArray:

@@ -8,7 +8,10 @@ import pytest
 
 from identify import drive
 from identify.fit import (
+    Evaluated,
     Fit,
+    FloatArray,
+    IntArray,
     OrbitResidual,
     covariance_of,
     failed,
@@ -70,6 +73,23 @@ def test_intervals_are_profiled_where_the_likelihood_is_no_parabola() -> None:
         )
         assert descent is not None
         assert np.sqrt(descent.cost - fit.chi2) == pytest.approx(1.96, abs=0.03)
+
+
+def test_a_descent_follows_a_curved_valley() -> None:
+    """Rosenbrock's, a thousand times as steep: 972 iterations if every step is straight."""
+    steep = 1e4
+
+    def valley(thetas: FloatArray, which: IntArray, jacobian: bool) -> Evaluated:
+        x, y = thetas.T
+        residual = np.stack([steep * (y - x**2), 1 - x], axis=1)
+        zero, one = np.zeros_like(x), np.ones_like(x)
+        J = np.stack([[-2 * steep * x, steep * one], [-one, zero]]).transpose(2, 0, 1)
+        return Evaluated(residual, J if jacobian else None, np.ones(x.size, dtype=bool))
+
+    (descent,) = levenberg_marquardt(valley, np.array([[-1.2, 1.0]]), iterations=100)
+    assert descent is not None
+    assert descent.converged
+    assert descent.theta == pytest.approx([1.0, 1.0], abs=1e-3)
 
 
 def test_what_the_data_do_not_determine_is_named() -> None:

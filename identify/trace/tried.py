@@ -80,11 +80,15 @@ class Tried:
         return self.adequate and self.plausible and (self.spread is None or self.fit_p > LEFT_P)
 
     @property
+    def deviance(self) -> float:
+        """χ², and what a spread's likelihood pays for the noise that it widens."""
+        return self.fit.chi2 + (0.0 if self.spread is None else self.spread.penalty)
+
+    @property
     def evidence(self) -> float:
         """χ² + p ln n: only compared between adequate candidates."""
-        if self.spread is None:
-            return _evidence(self.fit)
-        return _evidence(self.fit, len(self.spread.sizes)) + self.spread.penalty
+        more = 0 if self.spread is None else len(self.spread.sizes)
+        return self.deviance + (self.fit.theta.size + more) * float(np.log(self.fit.residual.size))
 
     @property
     def chi2_of_all(self) -> float:
@@ -118,11 +122,6 @@ class Tried:
         seen = all(known[n].stderr <= abs(values[n]) for n in located)
         modes = range(1, self.fit.structure.mode_count + 1)
         return inside and seen and all(values[f"mode{i}.damping"] < 0.7 for i in modes)
-
-
-def _evidence(fit: Fit, more: int = 0) -> float:
-    """χ² + p ln n of a fit, and of so many parameters more."""
-    return fit.chi2 + (fit.theta.size + more) * float(np.log(fit.residual.size))
 
 
 def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -259,13 +258,16 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
     worse. What takes a part of little may leave the cause behind, under the threshold. A spread
     does so by widening the noise: its likelihood is penalised for that, and must still gain, on
-    the law beside it and, so that one is claimed, on the spread alone."""
+    the law beside it and, so that one is claimed, on the spread alone, more than the likeliest of
+    all laws does by chance."""
     fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
     without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
     mostly = t.excess < without.excess / 3
     if t.spread is not None:
-        alone = [o.evidence for o in tries if o.spread and o.parts < t.parts]
-        return mostly and t.evidence < min([without.evidence, *alone]) - EVIDENCE
+        alone = [o for o in tries if o.spread and o.parts < t.parts]
+        found = all(gain_p(o.deviance - t.deviance, t, o.fit) < ALPHA for o in alone)
+        least = min([without.evidence, *(o.evidence for o in alone)])
+        return mostly and found and t.evidence < least - EVIDENCE
     worse = any(_predicts_worse(t, o) for o in fewer)
     gain = without.chi2_of_all - t.chi2_of_all
     return gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
