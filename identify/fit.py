@@ -35,7 +35,7 @@ IntArray = npt.NDArray[np.int64]
 
 LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
 HOPE = 20  # iterations for what may be given up as hopeless
-VALLEY = 8  # iterations after which a descent is taken to follow one
+VALLEY = 20  # iterations after which a descent is taken to follow one
 PROBE = 0.3  # of a step, where its curvature is looked at
 BENT = 0.4  # of the step that the bend may be
 
