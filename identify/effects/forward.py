@@ -175,7 +175,7 @@ class NonlinearDamping(Effect):
     are of the flame's velocity and act on all modes alike; with ``_mode`` of the singing mode's
     part, and on that mode alone: its damping grows. With ``_end`` the velocity is that of another
     place, where the modes meet in other proportions, v = Σ q_i y_i, and they act back on mode i by
-    g_i β: q_1 = g_1 = 1.
+    g_i β: q_1 = g_1 = 1, so that near a node of mode 1 the others are large.
     """
 
     name, location = "nonlinear_damping", "forward"
@@ -191,7 +191,7 @@ class NonlinearDamping(Effect):
             if law in self.laws
         )
         self.ratios = tuple(
-            Parameter(f"nonlinear_damping.{word}_ratio{i}", "1", -20.0, 20.0)
+            Parameter(f"nonlinear_damping.{word}_ratio{i}", "1", -100.0, 100.0)
             for i in range(2, (modes or 1) + 1)
             for word in ("end", "return")
         )
