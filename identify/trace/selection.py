@@ -99,7 +99,7 @@ def search(
         explaining = [t for t in going.tried if t.explains]
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
-        parents = sorted(level, key=lambda t: not t.fit.converged)[:2]
+        parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
         nowhere = size == 2 and not _a_place_to_grow_from(singles, base)
@@ -256,6 +256,8 @@ class _Searching:
         for share in SOFTENED:
             if not self.explained and _least(self.tried) > MUCH:
                 self._from_softened(share)
+        if not self.explained:
+            self.tried += _in_the_place_of_chance(self.tried, self.data, self.apart, self.run)
 
     def _from_softened(self, share: float) -> None:
         """An effect and chance that are both gross lead each other astray. Where noise of such a
@@ -323,6 +325,11 @@ def _a_place_to_grow_from(singles: Sequence[Tried], base: Fit) -> bool:
         return False
     others = min([*best[1:], np.inf])
     return best[0] <= GROSS or STANDS_OUT * best[0] < max(others, base.chi2_per_dof / STANDS_OUT)
+
+
+def _as_a_parent(t: Tried) -> float:
+    """Misfit; what has not converged may be at no place to grow from."""
+    return misfit(t) * (1.0 if t.fit.converged else BEHIND)
 
 
 def _least(tries: Sequence[Tried]) -> float:
@@ -402,6 +409,25 @@ def _beside_chance(
             larger = base.structure.with_effects(e)
             fit = fit_orbits(larger, wide, theta, continuation=(0.0,))
             out += try_scatters(larger, data, fit, [chance], run)
+    return out
+
+
+def _in_the_place_of_chance(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """What changes in the course of a campaign, in the place of what is no chance after all beside
+    a law that comes to the noise with it."""
+    out: list[Tried] = []
+    spreads = [t for t in tries if t.spread and t.adequate and not t.plausible]
+    for t in best_by_name([t for t in spreads if len(t.effects) == 2])[:BESIDE]:
+        structure = t.fit.structure
+        base = fit_orbits(structure, data, t.fit.theta, continuation=(0.0,), iterations=0)
+        courses = [e for e in available if e.location == "experiment" and e.name not in t.names]
+        if np.isfinite(base.chi2):
+            out += try_effects(
+                structure, data, base, courses, executor=run, keep=3, far=False,
+                progress=lambda done, text: None,
+            )  # fmt: skip
     return out
 
 

@@ -177,9 +177,8 @@ def _places(t: Tried) -> list[int]:
 
 
 def _merit(t: Tried) -> tuple[bool, float]:
-    """Adequate ones first, by evidence; the others by misfit."""
-    good = t.explains
-    return not good, _cost(t) if good else t.fit.chi2
+    """Adequate ones first, and by evidence: of as little misfit, what needs fewer parameters."""
+    return not t.explains, _cost(t)
 
 
 def _cost(t: Tried) -> float:
