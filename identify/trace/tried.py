@@ -30,6 +30,7 @@ LEFT_P = 0.03  # chance below which what a spread leaves is more than noise
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
+ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 USUAL = 3.0  # what a form must gain on one of the same effect that stands before it: more usual
 
@@ -258,7 +259,7 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     worse. What takes a part of little may leave the cause behind, under the threshold. A spread
     does so by widening the noise: its likelihood is penalised for that, and must still gain, on
     the law beside it and, so that one is claimed, on the spread alone, more than the likeliest of
-    all laws does by chance."""
+    all laws does by chance. And what is chance does not make the prediction many times worse."""
     fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
     without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
     mostly = t.excess < without.excess / 3
@@ -266,7 +267,8 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
         alone = [o for o in tries if o.spread and o.parts < t.parts]
         found = all(gain_p(o.deviance - t.deviance, t, o.fit) < ALPHA for o in alone)
         least = min([without.evidence, *(o.evidence for o in alone)])
-        return mostly and found and t.evidence < least - EVIDENCE
+        lost = t.validation_error > ASTRAY * declared.validation_error
+        return mostly and found and not lost and t.evidence < least - EVIDENCE
     worse = any(_predicts_worse(t, o) for o in fewer)
     gain = without.chi2_of_all - t.chi2_of_all
     return gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
