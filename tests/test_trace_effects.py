@@ -572,6 +572,22 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     assert trace.rivals(other, [replace(beside, validation_p=1e-17)]) == []
 
 
+def test_fitted_and_held_out_runs_speak_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fitted and held-out runs that noise alone hardly leaves, each for itself, refuse what both
+    were to be explained by; and what predicts them better is a rival, if of more parameters."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    skew = tried_as(fitted(11, 0.95), "channel_mismatch:skew")
+    mode = tried_as(fitted(14, 0.94), "acoustic_mode:mode")
+    assert trace.rivals(skew, [skew, replace(mode, held_out=(20.0, 20))]) == []
+    nearer = replace(mode, held_out=(14.0, 20))
+    assert trace.rivals(replace(skew, held_out=(22.0, 20)), [nearer]) == [nearer]
+
+    order = tried_as(fitted(12, 1.4), "flame_dynamics:second_order")
+    hardly = replace(order, fit_p=0.003, validation_p=0.009, held_out=(21.0, 20))
+    assert hardly.adequate
+    assert not replace(hardly, held_out=(39.0, 20)).adequate
+
+
 def test_a_form_that_extends_the_best_hides_no_rival(monkeypatch: pytest.MonkeyPatch) -> None:
     """A distributed delay is a delay and more; a resonance of the flame that does as well is not,
     though it goes by the same name and is a little less likely."""

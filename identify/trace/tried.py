@@ -72,7 +72,13 @@ class Tried:
 
     @property
     def adequate(self) -> bool:
-        return self.fit_p > ALPHA and not self.validation_p < ALPHA
+        return self.fit_p > ALPHA and not self.validation_p < ALPHA and not self.all_p < ALPHA
+
+    @property
+    def all_p(self) -> float:
+        """Chance that noise leaves as much of fitted and held-out runs together: two that are both
+        hardly noise are not."""
+        return assess.lack_of_fit_p(self.chi2_of_all, self.fit.dof + self.held_out[1])
 
     @property
     def explains(self) -> bool:
@@ -90,6 +96,11 @@ class Tried:
         """χ² + p ln n: only compared between adequate candidates."""
         more = 0 if self.spread is None else len(self.spread.sizes)
         return self.deviance + (self.fit.theta.size + more) * float(np.log(self.fit.residual.size))
+
+    @property
+    def evidence_of_all(self) -> float:
+        """The same as if all runs had been fitted, to first order."""
+        return self.evidence + self.held_out[0]
 
     @property
     def chi2_of_all(self) -> float:
@@ -209,7 +220,7 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         for t in others
         if t.key != best.key
         and (t.explains or _chance_rivals(t, best))
-        and t.evidence < best.evidence + EVIDENCE
+        and min(t.evidence - best.evidence, t.evidence_of_all - best.evidence_of_all) < EVIDENCE
         and not best.parts < t.parts
         and not _extends(t, best)
     ]
