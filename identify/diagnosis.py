@@ -273,7 +273,8 @@ def _judge(
     if good:
         best = trace.best_form(good)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
-        others = trace.rivals(best, [*good, *spreads])
+        implausible = [t for t in tried if t.spread is None and t.adequate and not t.plausible]
+        others = trace.rivals(best, [*good, *spreads, *implausible])
         words = best.words
         if not others:
             open_ = trace.other_forms(best, good)

@@ -19,7 +19,7 @@ from identify.harmonics import Harmonics
 from identify.record import Campaign, DeclaredModel
 from identify.results import Identification
 from identify.structure import NONLINEARITIES, Structure
-from identify.trace import GROSS, try_effects
+from identify.trace import astray, try_effects
 
 FloatArray = npt.NDArray[np.float64]
 Progress = Callable[[float, str], None]
@@ -140,7 +140,7 @@ def fit_structure(structure: Structure, data: Dataset) -> Fit:
             [effect],
             executor=InProcess(),
             keep=1,
-            far=not fit.converged or fit.chi2_per_dof > GROSS,
+            far=not fit.converged or astray(fit),
             progress=lambda share, text: None,
         )
         if not grown:

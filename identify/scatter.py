@@ -40,6 +40,7 @@ ROUNDS = 8
 LEAST_RUNS = 6  # forced runs below which a spread says nothing
 SQUARED = " squared"
 TREND_P = 0.003  # a rank correlation less probable than this is a law, not chance
+NOTHING = "no run deviates"  # an objection
 ONE_RUN = 0.9  # share of all deviation that a single run may hold
 SMALLEST = 1e-8
 UNSEEN = 1e-13  # singular value, relative to the largest, of what the data say nothing of
@@ -347,7 +348,7 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> st
             if np.ptp(known[word]) > 0 and rank_correlation(own, known[word])[1] < TREND_P:
                 return f"{name} follows the {word}: no chance"
     if not there.size:
-        return ""
+        return NOTHING
     residual, jacobian = _whitened(rows, sizes)
     deviations = _forced_tangents(rows, sizes, there)
     if scatter.location == "experiment":  # what wanders follows by chance what goes with the time

@@ -101,7 +101,7 @@ def test_a_form_that_the_data_leave_open_is_not_claimed(tmp_path: Path) -> None:
     forms = [by_key(f"actuator_dynamics:{form}") for form in ("pole", "delay")]
     found = trace.try_effects(
         ready.structure, ready.data, base, forms, executor=InProcess(), keep=2,
-        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
+        far=trace.astray(base), progress=lambda share, text: None,
     )  # fmt: skip
     best = trace.best_form(found)
     (chosen,) = best.effects
@@ -112,7 +112,7 @@ def test_a_form_that_the_data_leave_open_is_not_claimed(tmp_path: Path) -> None:
 
 def test_an_amplifier_at_its_rails(tmp_path: Path) -> None:
     ready, base = recorded(tmp_path, 29, "actuator_nonlinearity", clip_v=1.1)
-    assert base.chi2_per_dof > trace.GROSS
+    assert trace.astray(base)
     found = only(ready, base, "actuator_nonlinearity:knee")
     assert found.adequate
     level = found.estimates["actuator_nonlinearity.level_v"]
@@ -123,7 +123,7 @@ def test_data_corrected_for_a_known_effect_need_it_no_more(tmp_path: Path) -> No
     """The drive of a resonant speaker, filtered by the resonance, fits the declared model."""
     truth = {"resonance_hz": 150.0, "damping": 0.3}
     ready, base = recorded(tmp_path, 3, "actuator_dynamics", **truth)
-    assert base.chi2_per_dof > trace.GROSS
+    assert trace.astray(base)
     values = {"actuator_dynamics.frequency_hz": 150.0, "actuator_dynamics.damping": 0.3}
     effect = by_key("actuator_dynamics:resonance")
     clean = start.corrected(ready.data, [effect], values)
@@ -163,7 +163,7 @@ def test_laws_with_corners_and_losses_elsewhere(
     (effect,) = [e for e in effects if trace.usable(e, ready.data, ready.structure)]
     found = trace.try_effects(
         ready.structure, ready.data, base, [effect], executor=InProcess(), keep=1,
-        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
+        far=trace.astray(base), progress=lambda share, text: None,
     )  # fmt: skip
     assert found[0].adequate
 

@@ -50,7 +50,7 @@ def only(ready: Prepared, base: Fit, key: str) -> trace.Tried:
     """The best fit with that effect and no other tried."""
     found = trace.try_effects(
         ready.structure, ready.data, base, [by_key(key)], executor=InProcess(), keep=1,
-        far=base.chi2_per_dof > trace.GROSS, progress=lambda share, text: None,
+        far=trace.astray(base), progress=lambda share, text: None,
     )  # fmt: skip
     return trace.started_again(found, ready.data, InProcess())[0]
 

@@ -114,14 +114,16 @@ class SideResonator(Effect):
     on mode i by −κ_i y''. So κ_i ω² s/(s² + 2ζωs + ω²) loads the velocity there; q_1 = 1, so that
     near a node of mode 1 the others have no bound.
     Other than one more mode, it moves the poles of the others, and its residues have phases.
+    Beside the singing mode the load on that one alone is most of it: ``side_resonator_mode``.
     """
 
-    name, location, form = "acoustic_mode", "forward", "side_resonator"
-    refines = True
+    name, location = "acoustic_mode", "forward"
 
-    def __init__(self, modes: int) -> None:
-        self.mode_count = self.count = modes
-        each = range(1, modes + 1)
+    def __init__(self, modes: int | None = None) -> None:
+        self.form = "side_resonator_mode" if modes is None else "side_resonator"
+        self.mode_count, self.count = modes, modes or 1
+        self.refines = modes is not None
+        each = range(1, self.count + 1)
         self.parameters = (
             Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
             Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
@@ -131,12 +133,23 @@ class SideResonator(Effect):
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         ones = (1.0,) * (self.count - 1)
-        places = [q * known.free_hz for q in (0.8, 1.3, 1.9)]
-        return [(f, 0.04, *(3e-3,) * self.count, *ones) for f in places]
+        places = (0.8, 1.3, 1.9) if self.refines else (0.8, 0.9, 1.05, 1.15, 1.4)
+        size = 3e-3 if self.refines else 1e-3
+        return [(q * known.free_hz, 0.04, *(size,) * self.count, *ones) for q in places]
+
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        if self.refines:
+            return []
+        frequencies = known.free_hz * np.geomspace(0.6, 1.7, 27)
+        return [(float(f), zeta, 0.0) for f in frequencies for zeta in (0.02, 0.05)]
 
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
         """From one more mode: at its frequency the load takes the place of its residues, so that
-        r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise; κ_i is taken to go as q_i."""
+        r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise; κ_i is taken to go as q_i. From
+        mode 1 alone to all."""
+        if isinstance(other, SideResonator) and self.refines:
+            none = (0.0,) * (self.count - 1)
+            return [(*(values[q.name] for q in other.parameters), *none, *none)]
         if not isinstance(other, AcousticMode) or other.more > 1:
             return []
         f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
@@ -237,7 +250,8 @@ class NonlinearDamping(Effect):
 EFFECTS: tuple[Effect, ...] = (
     AcousticMode(),
     AcousticMode("two_modes", 2),
-    *(SideResonator(n) for n in (1, 2, 3)),
+    SideResonator(),
+    *(SideResonator(n) for n in (2, 3)),
     NonlinearDamping("quadratic"),
     NonlinearDamping("quadratic_mode"),
     NonlinearDamping("cubic"),

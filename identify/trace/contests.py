@@ -38,6 +38,7 @@ Progress = Callable[[float, str], None]
 #: A set of effects, those of them that are kept, the one that is not, what comes in its place.
 _Exchange = tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]
 
+TOGETHER = ("nonlinearity_shape", "actuator_nonlinearity")  # of which two laws may be met at once
 UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
 SETTLED = 16  # of the nearest of them are led on
 RUNNERS_UP = 2  # sets whose other forms are tried for that
@@ -147,6 +148,7 @@ def in_each_form(
             if form.name == e.name
             and form.key != e.key
             and suits(form, t.fit.structure, kept)
+            and joins(form, kept)
             and not (form.refines and t.explains)
             and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
             and key_of_forms((*kept, form)) not in done
@@ -161,6 +163,15 @@ def suits(form: Effect, structure: Structure, beside: Sequence[Effect]) -> bool:
     plain = replace(structure, effects=())
     fuller = [r.mode_count for e in beside if (r := e.restated(plain)) is not None]
     return form.mode_count in (None, plain.mode_count, *fuller)
+
+
+def joins(effect: Effect, beside: Sequence[Effect]) -> bool:
+    """Whether an effect may stand beside others: one of the same name does where two such laws are
+    met together, and where none of its parameters is theirs."""
+    known = {q.name for o in beside for q in o.parameters}
+    if all(o.name != effect.name for o in beside):
+        return True
+    return effect.name in TOGETHER and not known & {q.name for q in effect.parameters}
 
 
 def _refitted(items: Sequence[_Exchange], data: Dataset, run: Executor) -> list[Tried]:
@@ -350,9 +361,8 @@ def in_their_places(
     """Other effects in the place of each of several that explain the data together.
 
     The set was grown from one of them, so that only the places of the others have been contested.
-    Where what remains without an effect is gross, that effect had its contest as a single one, and
-    beside the others only those `at_the_same_place` are near. One effect in the place of them all
-    is sought too, from what they say of the declared model.
+    Where what remains without an effect is gross, the others start from where the set has ended.
+    One effect in the place of them all is sought too, from what they say of the declared model.
     `extended` are the sets (of keys, sorted) that have been grown from already, with the misfit
     that they had there.
     """
@@ -366,8 +376,11 @@ def in_their_places(
     out: list[Tried] = []
     for kept in [*combinations(best.effects, len(best.effects) - 1), ()]:
         base = with_fewer(best, kept, data) if kept else part_of(best, (), data)
-        if not np.isfinite(base.chi2) or (kept and base.chi2_per_dof > GROSS):
-            continue  # no place to start from
+        if kept and not base.chi2_per_dof < GROSS:  # no place to start from
+            out += _from_the_end(best, kept, data, available, run, tries)
+            continue
+        if not np.isfinite(base.chi2):
+            continue
         if kept and extended.get(key_of_forms(kept), np.inf) < 2 * base.chi2:
             continue  # what stands beside it from about there has been seen
         names = {e.name for e in kept}
@@ -377,7 +390,26 @@ def in_their_places(
             executor=run, keep=5, far=False, scores=None if kept else {},
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
-    return [eliminate(t, data) for t in out]
+    return [eliminate(t, data) if t.explains else t for t in out]
+
+
+def _from_the_end(
+    t: Tried,
+    kept: tuple[Effect, ...],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    tries: Sequence[Tried],
+) -> list[Tried]:
+    """Other effects beside those `kept` of `t`, in the place of the one that is not."""
+    (old,) = (e for e in t.effects if e not in kept)
+    done = {o.key_of_forms for o in tries if o.adequate}
+    others = [
+        (t, kept, old, e, data)
+        for e in available
+        if e.name not in t.names and not e.refines and key_of_forms((*kept, e)) not in done
+    ]
+    return _refitted(others, data, run)
 
 
 def led_on(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:

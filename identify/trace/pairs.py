@@ -34,7 +34,7 @@ STANDING = {
     "flame_dynamics:pole",
     "flame_dynamics:second_time_scale",
     "flame_dynamics:second_order",
-    "nonlinearity_shape:quintic",
+    "nonlinearity_shape:quartic_quintic",
     "nonlinearity_shape:tanh",
     "nonlinearity_shape:quadratic_odd",
     "actuator_dynamics:resonance",

@@ -20,6 +20,7 @@ from identify.trace.contests import (
     in_each_form,
     in_other_forms,
     in_their_places,
+    joins,
     led_on,
     reformed,
     runners_up,
@@ -36,6 +37,7 @@ from identify.trace.tried import (
     GROSS,
     Tried,
     accounts,
+    astray,
     best_by_name,
     best_form,
     first_of_each,
@@ -103,7 +105,9 @@ def search(
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
         nowhere = size == 2 and not _a_place_to_grow_from(singles, base)
-        found = going.pairs(singles) if nowhere else going.grown(parents)
+        found = going.pairs(singles) if nowhere else []
+        if not going.explained or not nowhere:
+            found += going.grown(parents)
         if size == 2:
             going.with_chance(parents)
             if not nowhere and base.chi2_per_dof > GROSS and _least(found) > MUCH:
@@ -151,7 +155,7 @@ class _Searching:
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
         data, base, run = self.data, self.base, self.run
-        far = base.chi2_per_dof > GROSS
+        far = astray(base)
         singles = try_effects(
             self.structure, data, base, self.apart, executor=run, keep=8, far=far,
             progress=lambda share, text: self.report(0.6 * share, text), scores=scores,
@@ -185,21 +189,19 @@ class _Searching:
             lambda share, text: self.report(0.6 + 0.3 * share, text),
         )  # fmt: skip
         pairs = self._led_to_the_end(pairs)
-        # all that may stand beside one of them has been sought beside it already
-        self.extended |= {(e.key,): 0.0 for t in pairs if t.explains for e in t.effects}
         self.tried += [eliminate(t, self.data) if t.explains else t for t in pairs]
         return pairs
 
     def grown(self, parents: Sequence[Tried]) -> list[Tried]:
         """One effect more on top of each of `parents`."""
         grown: list[Tried] = []
-        far = self.base.chi2_per_dof > GROSS and not self.explained
+        far = astray(self.base) and not self.explained
         for parent in parents:
             self.extended[parent.key_of_forms] = parent.fit.chi2
             rest = [
                 e
                 for e in (*self.apart, *self.fuller)
-                if e.name not in parent.names and suits(e, self.structure, parent.effects)
+                if joins(e, parent.effects) and suits(e, self.structure, parent.effects)
             ]
             grown += try_effects(
                 parent.fit.structure, self.data, parent.fit, rest, executor=self.run, keep=5,
@@ -270,7 +272,7 @@ class _Searching:
             return
         laws = try_effects(
             self.structure, soft, base, self.apart, executor=run, keep=5,
-            far=base.chi2_per_dof > GROSS, progress=lambda done, text: None,
+            far=astray(base), progress=lambda done, text: None,
         )  # fmt: skip
         found = []
         for t in best_by_name(laws)[:FOREMOST]:
@@ -361,7 +363,12 @@ def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
     out = []
     for t in tries:
         if t.adequate:
-            fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.003, 0.0))
+            # what it knows to within the noise, coarse noise would lose
+            fits = [
+                fit_orbits(t.fit.structure, data, t.fit.theta, continuation=steps)
+                for steps in ((0.003, 0.0), (0.0,))
+            ]
+            fit = min(fits, key=lambda f: f.chi2)
             if np.isfinite(fit.chi2):
                 out.append(tried(t.fit.structure.effects, fit, data))
     return out
@@ -461,7 +468,7 @@ def _beside_the_same_chance(
     for t in best_by_name(found):
         if t.explains:
             out += try_scatters(t.fit.structure, data, t.fit, [chance], run)
-    return out
+    return [*out, *_without_chance(out, data)]
 
 
 def try_scatters(

@@ -26,6 +26,8 @@ K = TypeVar("K", bound=Hashable)
 
 ALPHA = 1e-3  # false-alarm probability of each significance test
 GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
+OVERDAMPED = 0.15  # damping ratio of a mode that has strayed, where a misfit is left …
+VISIBLE = 10.0  # … of so much χ²/dof
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
@@ -57,8 +59,11 @@ class Tried:
 
     @property
     def parts(self) -> frozenset[str]:
-        """What it consists of, whatever the forms: a law and chance may go by the same name."""
-        return frozenset(e.key if isinstance(e, Scatter) else e.name for e in self.effects)
+        """What it consists of, whatever the forms: a law and chance may go by the same name, and
+        two laws: the second adds to the first."""
+        laws = [e.name for e in self.effects if not isinstance(e, Scatter)]
+        again = {f"{name}, once more" for name in laws if laws.count(name) > 1}
+        return frozenset({*laws, *again, *(e.key for e in self.effects if isinstance(e, Scatter))})
 
     @property
     def words(self) -> str:
@@ -134,6 +139,14 @@ class Tried:
         seen = all(known[n].stderr <= abs(values[n]) for n in located)
         modes = range(1, self.fit.structure.mode_count + 1)
         return inside and seen and all(values[f"mode{i}.damping"] < 0.7 for i in modes)
+
+
+def astray(fit: Fit) -> bool:
+    """Whether a fit is no place to start from alone: for its misfit, or since what it lacks has
+    been taken up by a damping that no mode of a tube that sings has."""
+    modes = range(1, fit.structure.mode_count + 1)
+    damped = max(fit.values[f"mode{i}.damping"] for i in modes)
+    return fit.chi2_per_dof > (VISIBLE if damped > OVERDAMPED else GROSS)
 
 
 def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
@@ -219,13 +232,21 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         t
         for t in others
         if t.key != best.key
-        and (t.explains or _chance_rivals(t, best))
+        and (t.explains or _chance_rivals(t, best) or _stands_for_another(t, best))
         and min(t.evidence - best.evidence, t.evidence_of_all - best.evidence_of_all) < EVIDENCE
         and not best.parts < t.parts
         and not _extends(t, best)
     ]
     found = best_by_name(every)
     return [t for t in found if not any(o.parts < t.parts for o in found)]
+
+
+def _stands_for_another(t: Tried, best: Tried) -> bool:
+    """Whether a law of no more effects is far likelier, though its values cannot be true, or the
+    data do not tell them."""
+    if t.spread is not None or t.plausible or len(t.effects) > len(best.effects):
+        return False
+    return t.adequate and t.evidence < best.evidence - EVIDENCE
 
 
 def _chance_rivals(spread: Tried, best: Tried) -> bool:
@@ -270,7 +291,8 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     worse. What takes a part of little may leave the cause behind, under the threshold. A spread
     does so by widening the noise: its likelihood is penalised for that, and must still gain, on
     the law beside it and, so that one is claimed, on the spread alone, more than the likeliest of
-    all laws does by chance. And what is chance does not make the prediction many times worse."""
+    all laws does by chance. And chance beside a law does not make the prediction many times worse
+    (alone, it does where the declared model had followed it)."""
     fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
     without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
     mostly = t.excess < without.excess / 3
@@ -278,7 +300,8 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
         alone = [o for o in tries if o.spread and o.parts < t.parts]
         found = all(gain_p(o.deviance - t.deviance, t, o.fit) < ALPHA for o in alone)
         least = min([without.evidence, *(o.evidence for o in alone)])
-        lost = t.validation_error > ASTRAY * declared.validation_error
+        hidden = t.validation_error > ASTRAY * declared.validation_error
+        lost = len(t.effects) > 1 and hidden
         return mostly and found and not lost and t.evidence < least - EVIDENCE
     worse = any(_predicts_worse(t, o) for o in fewer)
     gain = without.chi2_of_all - t.chi2_of_all
