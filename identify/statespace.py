@@ -4,10 +4,11 @@ A mode, y'' + 2ζω y' + ω² y = a u' ' + r F'', has two states in observer for
 
     y = r F + z₁,   z₁' = a u' − 2ζω y + z₂,   z₂' = −ω² y
 
-First-order lags have one state. A delay is no finite state space: it becomes a Padé approximation
-whose order follows from the error asked for within a band. What effects add to the actuator and
-the flame path is known only as a function of s: it is recognised as a rational function of low
-order or as a pure delay, and refused otherwise.
+A branch beside the tube feeds the velocity at its mouth back to the modes as a force. First-order
+lags have one state. A delay is no finite state space: it becomes a Padé approximation whose order
+follows from the error asked for within a band. What effects add to the actuator, the flame path
+and beside the tube is known only as a function of s: it is recognised as a rational function of
+low order or as a pure delay, and refused otherwise.
 """
 
 from collections.abc import Callable
@@ -22,7 +23,7 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.fit import Fit
-from identify.structure import MODAL, Conditions, Effect, Mode, Structure, declared_modes
+from identify.structure import MODAL, Branch, Conditions, Effect, Mode, Structure, declared_modes
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -99,9 +100,6 @@ def state_space(fit: Fit, part: Part = "forward", band_hz: float | None = None) 
     """
     if not fit.converged:
         raise ValueError(f"the fit did not converge ({fit.reason}); it has no state space")
-    for e in fit.structure.effects:
-        if part != "flame" and type(e).branch is not Effect.branch:
-            raise ValueError(f"effect {e.key}, a branch beside the tube, has no state space here")
     p = fit.values
     modes = _modes(fit.structure, p)
     top = band_hz if band_hz is not None else 4.0 * max(float(m.frequency_hz) for m in modes)
@@ -136,7 +134,7 @@ def linear_poles(
             continue
         kept.append(e)
     reduced = replace(structure, effects=tuple(kept))
-    acoustics = _acoustics(modes)
+    acoustics = _acoustics(structure, p, modes, band)
     slope = small_signal_slope(structure, p) if gain is None else gain
     found = np.linalg.eigvals(_closed(acoustics, _flame(reduced, p, modes, band), slope).A)
     return np.asarray(found[(found.imag >= 0) & (np.abs(found) < band)], dtype=complex)
@@ -156,7 +154,17 @@ def _modes(structure: Structure, p: dict[str, float]) -> list[Mode]:
     return [Mode(*(float(np.ravel(getattr(m, n))[0]) for n in MODAL)) for m in modes]
 
 
-def _acoustics(modes: list[Mode]) -> StateSpace:
+def _acoustics(
+    structure: Structure, p: dict[str, float], modes: list[Mode], band: float
+) -> StateSpace:
+    tube = _tube(modes)
+    for e in structure.effects:
+        if type(e).branch is not Effect.branch:
+            tube = _beside(tube, e, p, modes, band)
+    return tube
+
+
+def _tube(modes: list[Mode]) -> StateSpace:
     n = len(modes)
     A, B = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, 2))
     C, D = np.zeros((1, 2 * n)), np.zeros((1, 2))
@@ -171,10 +179,40 @@ def _acoustics(modes: list[Mode]) -> StateSpace:
     return StateSpace(A, B, C, D)
 
 
+def _beside(
+    tube: StateSpace, effect: Effect, p: dict[str, float], modes: list[Mode], band: float
+) -> StateSpace:
+    """The tube with a branch: v = Σ q_i y_i there, and the force −g_i Z v on mode i."""
+
+    def branch(s: Any) -> Branch:
+        found = effect.branch(p, modes, s)
+        assert found is not None
+        return found
+
+    w0 = 2 * np.pi * modes[0].frequency_hz
+    load = realise(lambda s: branch(s).impedance, effect.key, w0, band) or _gain(1.0)
+    still = branch(np.array([[1j * w0]]))
+    felt, returned = (np.array(x, dtype=float) for x in (still.felt, still.returned))
+    A, B, C, D = tube
+    there, through = np.zeros_like(C), np.zeros_like(D)
+    there[0, ::2] = felt
+    through[0, 1] = sum(q * m.flame_residue for q, m in zip(felt, modes, strict=True))
+    force = np.zeros((A.shape[0], 1))
+    force[::2, 0] = -returned
+    back = force @ load.D
+    none = np.zeros((1, load.A.shape[0]))
+    return StateSpace(
+        np.block([[A + back @ there, force @ load.C], [load.B @ there, load.A]]),
+        np.vstack([B + back @ through, load.B @ through]),
+        np.hstack([C, none]),
+        D,
+    )
+
+
 def _forward(
     structure: Structure, p: dict[str, float], modes: list[Mode], band: float
 ) -> StateSpace:
-    acoustics = _acoustics(modes)
+    acoustics = _acoustics(structure, p, modes, band)
     w0 = 2 * np.pi * modes[0].frequency_hz
     for e in structure.effects:
         actuator = realise(partial(e.actuator, p, standing_still()), e.key, w0, band)

@@ -23,12 +23,8 @@ KNOWN = Known(
     169.0, (168.8, 281.3), (0.01, 0.05), (44.3, -16.2), (35.2, -34.0), 2e-4, 0.25, 1.0,
     (160.0, 900.0), 8,
 )  # fmt: skip
-BRANCH = "acoustic_mode:side_resonator"
-LINEAR = [
-    e
-    for e in CATALOGUE
-    if e.location in ("forward", "flame", "actuator", "experiment") and e.key != BRANCH
-]
+PLACES = ("forward", "flame", "actuator", "experiment")
+LINEAR = [e for e in CATALOGUE if e.location in PLACES and e.mode_count in (None, 2)]
 IRRATIONAL = "flame_dynamics:distributed_delay"
 STRUCTURES = {
     "declared": Structure(),
@@ -86,13 +82,6 @@ def test_state_space_refuses_what_is_not_rational() -> None:
     theta[-1] += 0.1
     with pytest.raises(ValueError, match=r"distributed_delay.*neither rational"):
         to_state_space(replace(fit, theta=theta), "flame")
-
-
-def test_state_space_refuses_a_branch_beside_the_tube() -> None:
-    (effect,) = (e for e in CATALOGUE if e.key == BRANCH and e.mode_count == 2)
-    with pytest.raises(ValueError, match=r"side_resonator, a branch beside the tube"):
-        to_state_space(with_effect(effect))
-    assert to_state_space(with_effect(effect), "flame").A.shape == (1, 1)
 
 
 def test_state_space_refuses_a_negative_delay() -> None:

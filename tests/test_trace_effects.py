@@ -557,7 +557,7 @@ def test_unexplained_says_where(tmp_path: Path) -> None:
 
 def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     """A spread beside an effect is not claimed where a law explains the data with less."""
-    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
+    ready = thesis_campaign(tmp_path, 8, {"flame_delay": {"delay_s": 3e-4}})
     base = start.fit_from_data(ready.structure, ready.data)
     law = trace.try_effects(
         ready.structure, ready.data, base, [by_key("flame_delay")], executor=InProcess(), keep=1,

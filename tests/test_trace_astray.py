@@ -1,0 +1,129 @@
+"""Where the declared fit has gone astray, or the first explanation is not the right one."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identify import start, trace
+from identify.effects import CATALOGUE, by_key
+from identify.effects.forward import SideResonator
+from identify.effects.scatter import SCATTERS
+from identify.executor import InProcess
+from identify.fit import fit_orbits
+from identify.scatter import fit_scatter
+from identify.trace.contests import in_their_places, joins
+from identify.trace.tried import tried
+from tests.trace_material import fitted, only, thesis_campaign, tried_as
+
+pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
+
+
+def test_a_side_resonator_beside_the_singing_mode_starts_from_that_mode_alone(
+    tmp_path: Path,
+) -> None:
+    """Where the noise is little, no further mode comes near: the singing mode's own damping and
+    frequency change within its band. The load on that mode alone leads to the load on all."""
+    branch = {"frequency_hz": 186.0, "damping": 0.05, "coupling": 0.02}
+    ready = thesis_campaign(tmp_path, 5, {"side_resonator": branch}, noise_db=115.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    mode = only(ready, base, "acoustic_mode:mode")
+    alone = only(ready, base, "acoustic_mode:side_resonator_mode")
+    assert alone.explains
+    assert mode.fit.chi2 > 100 * alone.fit.chi2
+    assert alone.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(186.0, abs=0.5)
+    whole = SideResonator(2)
+    (row,) = whole.starts_from(alone.effects[0], alone.fit.values)
+    theta = np.r_[alone.fit.theta[: len(ready.structure.parameters)], whole.to_internal(row)]
+    larger = ready.structure.with_effects(whole)
+    same = fit_orbits(larger, ready.data, theta, continuation=(0.0,), iterations=0)
+    assert same.chi2 == pytest.approx(alone.fit.chi2, rel=1e-6)
+
+
+def test_a_damping_that_no_mode_has_sends_the_search_afar() -> None:
+    """A declared fit may take up a delay by a singing mode of half the critical damping."""
+    fit = fitted(11, 20.0)
+    index = fit.structure.parameters.index
+    theta = np.zeros(len(index))
+    theta[[index["mode1.damping"], index["mode2.damping"]]] = np.log(0.02)
+    usual = replace(fit, theta=theta)
+    assert not trace.astray(usual)
+    assert trace.astray(replace(usual, chi2=400.0 * usual.dof))
+    theta = theta.copy()
+    theta[index["mode1.damping"]] = np.log(0.4)
+    assert trace.astray(replace(usual, theta=theta))
+    assert not trace.astray(replace(usual, theta=theta, chi2=3.0 * usual.dof))
+
+
+def test_what_stands_in_another_s_place_beside_a_gross_effect(tmp_path: Path) -> None:
+    """Of two gross effects neither leaves a place to start from: a microphone's lag that came up
+    first beside a further mode gives way to the speaker's delay, from where it ended."""
+    mode = {
+        "frequency_hz": 394.0,
+        "damping": 0.05,
+        "flame_residue_ratio": 0.15,
+        "speaker_residue_ratio": -0.15,
+    }
+    effects = {"acoustic_mode": mode, "actuator_dynamics/delay": {"delay_s": 1e-4}}
+    ready = thesis_campaign(tmp_path, 5, effects, noise_db=60.0)
+    both = [by_key("acoustic_mode:mode"), by_key("actuator_dynamics:delay")]
+    base = start.fit_from_data(ready.structure, ready.data)
+    further = only(ready, base, both[0].key).fit
+    structure = ready.structure.with_effects(*both)
+    theta = np.r_[further.theta, both[1].to_internal((1e-4,))]
+    truth = fit_orbits(structure, ready.data, theta, continuation=(0.003, 0.0), iterations=300)
+    assert tried(tuple(both), truth, ready.data).explains
+    wrong = ready.structure.with_effects(both[0], by_key("sensor_dynamics:lowpass"))
+    first = tried(wrong.effects, fit_orbits(wrong, ready.data, truth.theta), ready.data)
+    lucky = replace(first.fit, chi2=1.2 * first.fit.dof)  # as with a little more noise
+    claimed = replace(first, fit=lucky, fit_p=0.1, validation_p=0.5, held_out=(0.0, 0))
+    others = [by_key(k) for k in ("flame_delay", "actuator_dynamics:delay", "channel_mismatch")]
+    found = in_their_places(
+        [claimed], ready.data, others, InProcess(), {}, lambda share, text: None
+    )
+    best = min(found, key=lambda t: t.fit.chi2)
+    assert best.key == ("acoustic_mode", "actuator_dynamics")
+    assert best.explains
+
+
+def test_a_law_far_likelier_whose_values_are_not_known_is_a_rival(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The data may tell an effect and not its parameters: it is no explanation to be claimed, but
+    what does far worse is none either. A spread is held against it elsewhere."""
+    unknown = ("flame_dynamics",)
+    monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: t.names != unknown))
+    mode = tried_as(fitted(14, 1.3), "acoustic_mode:mode")
+    better = tried_as(fitted(12, 1.1), "flame_dynamics:second_time_scale")
+    assert trace.rivals(mode, [mode, better]) == [better]
+    as_good = tried_as(fitted(12, 1.28), "flame_dynamics:second_time_scale")
+    assert as_good.evidence > mode.evidence - 10.0
+    assert trace.rivals(mode, [mode, as_good]) == []
+
+
+def test_chance_that_moves_no_run_is_none(tmp_path: Path) -> None:
+    """Beside an effect that explains the data, a spread ends at nothing."""
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
+    law = only(ready, start.fit_from_data(ready.structure, ready.data), "flame_delay")
+    assert law.explains
+    spreads = [fit_scatter(law.fit.structure, ready.data, law.fit, s) for s in SCATTERS]
+    assert [s and s.objection for s in spreads] == ["no run deviates"] * len(SCATTERS)
+
+
+def test_two_laws_of_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A quartic term and a hysteresis may be met together; two forms that say the same with other
+    numbers, or two modes of one name, may not. Each is more than either law alone."""
+    by = {e.key: e for e in CATALOGUE}
+    quartic, width = by["nonlinearity_shape:quartic"], by["nonlinearity_shape:hysteresis"]
+    assert joins(width, [quartic])
+    assert joins(width, [by["flame_delay"]])
+    assert not joins(by["nonlinearity_shape:quartic_quintic"], [quartic])
+    assert not joins(by["nonlinearity_shape:dead_zone"], [width])
+    assert not joins(by["nonlinear_damping:quadratic"], [by["nonlinear_damping:cubic"]])
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    one = tried_as(fitted(10, 40.0), quartic.key)
+    two = tried_as(fitted(11, 1.0), quartic.key, width.key)
+    assert one.parts < two.parts
+    assert trace.accounts(two, tried_as(fitted(9, 80.0)), [one, two])
+    assert trace.rivals(one, [two]) == []
