@@ -144,12 +144,13 @@ class ModalOffset(Effect):
         self.form = f"modal_{modes}"
         self.mode_count = modes
         self.parameters = tuple(
-            Parameter(f"sensor_offset.ratio{i}", "1", -5.0, 5.0, scale=1e-2)
+            Parameter(f"sensor_offset.ratio{i}", "1", -50.0, 50.0, scale=1e-2)
             for i in range(2, modes + 1)
         )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(q,) * len(self.parameters) for q in (0.98, 1.02, 0.8, 1.25, 0.6, 1.6)]
+        near, beyond = (0.98, 1.02, 0.8, 1.25, 0.6, 1.6), (0.2, -0.3, -1.0, -3.0, -8.0, 3.0, 8.0)
+        return [(q,) * len(self.parameters) for q in (*near, *beyond)]
 
     def neutral(self) -> tuple[float, ...]:
         return (1.0,) * len(self.parameters)

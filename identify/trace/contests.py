@@ -256,14 +256,19 @@ def reformed(
     run: Executor,
     done: set[tuple[str, ...]],
 ) -> list[Tried]:
-    """Other forms of the best few sets near to the noise, and of what comes of them.
+    """Other forms of the best few sets near to the noise, and of what comes of them; where even the
+    best leaves a gross misfit, of those near to it.
 
     Those in `done` (keys of forms) have had theirs; what is seen to here joins them.
     """
     out: list[Tried] = []
     least = np.inf  # misfit of the best set of which a form explains the data
-    for i, first in enumerate(best_by_name(grown)[:REFORMED]):
-        near = first.fit.chi2_per_dof < (GROSS if i == 0 else NEAR)
+    best = best_by_name(grown)[:REFORMED]
+    for first in best:
+        if best[0].fit.chi2_per_dof > GROSS:
+            near = first.fit.chi2 < BEHIND * best[0].fit.chi2
+        else:
+            near = first is best[0] or first.fit.chi2_per_dof < NEAR
         if not near or first.fit.chi2 > BEHIND * least:
             continue
         found = _in_all_forms(first, data, available, run, done)
