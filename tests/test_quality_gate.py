@@ -422,6 +422,17 @@ def test_free_runs_that_are_none(clean: Campaign) -> None:
     assert judged(clean, noise, 0)[1] == {"no_limit_cycle": "excluded"}
 
 
+def test_the_highest_bin_of_noise_is_no_limit_cycle(clean: Campaign) -> None:
+    """At 22 Hz there are few bins, of which the highest has half of the power."""
+    rng = np.random.default_rng(2)
+    tone = pressures(
+        lambda x, t: 0.3 * rng.standard_normal(t.size) + 0.016 * np.cos(2 * np.pi * 22 * t)
+    )
+    found, flags, _ = judged(clean, tone, 0)
+    assert flags == {"no_limit_cycle": "excluded"}
+    assert "22.0 Hz, has 52 %" in found.flags[0].detail
+
+
 def test_noise_at_low_frequency(clean: Campaign) -> None:
     rng = np.random.default_rng(6)
     wind = 2.0 * np.cumsum(rng.standard_normal(20000))

@@ -12,10 +12,11 @@ from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import fit_orbits
+from identify.identification import prepare
 from identify.scatter import fit_scatter
-from identify.trace.contests import in_their_places, joins
+from identify.trace.contests import in_their_places, joins, reformed
 from identify.trace.tried import tried
-from tests.trace_material import fitted, only, thesis_campaign, tried_as
+from tests.trace_material import campaign, fitted, only, thesis_campaign, tried_as
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -127,3 +128,37 @@ def test_two_laws_of_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert one.parts < two.parts
     assert trace.accounts(two, tried_as(fitted(9, 80.0)), [one, two])
     assert trace.rivals(one, [two]) == []
+
+
+def test_a_velocity_taken_beyond_a_node(tmp_path: Path) -> None:
+    """There the modes' shares are of the other sign, and of any size."""
+    ready = prepare(campaign(tmp_path, 232, "sensor_offset", noise_db=110.0, offset_m=0.05))
+    base = start.fit_from_data(ready.structure, ready.data)
+    found = only(ready, base, "sensor_offset:modal_2")
+    assert found.explains
+    # v(x + 0.05 m)/v(x) of mode 2 over that of mode 1
+    assert found.estimates["sensor_offset.ratio2"].value == pytest.approx(-5.10753, abs=1e-4)
+
+
+def test_other_forms_of_what_leaves_a_gross_misfit(tmp_path: Path) -> None:
+    """Two gross effects, the nearest forms of which are not yet the right ones: a hard clip for
+    a knee, a loss on all modes alike for one that acts at the open end."""
+    clipping, cubic = "actuator_nonlinearity:clipping", "nonlinear_damping:cubic"
+    effects = {
+        "actuator_nonlinearity/clipping": {"clip_v": 1.0},
+        "nonlinear_damping/cubic": {"cubic_s_per_m2": 14.0},
+    }
+    ready = thesis_campaign(tmp_path, 5, effects, noise_db=110.0)
+    both = by_key(clipping), by_key(cubic)
+    base = start.fit_from_data(ready.structure, ready.data)
+    theta = np.r_[base.theta, both[0].to_internal((1.0,)), both[1].to_internal((14.0,))]
+    structure = ready.structure.with_effects(*both)
+    first = tried(both, fit_orbits(structure, ready.data, theta), ready.data)
+    assert first.fit.chi2_per_dof > 1000
+    wanted = {"actuator_nonlinearity:knee", "nonlinear_damping:cubic_end"}
+    forms = [e for e in CATALOGUE if e.key in wanted]
+    found = reformed([first], ready.data, forms, InProcess(), set())
+    (right,) = (t for t in found if t.explains)
+    assert set(right.key_of_forms) == wanted
+    assert right.estimates["actuator_nonlinearity.level_v"].value == pytest.approx(1.0, abs=1e-3)
+    assert right.estimates["actuator_nonlinearity.order"].value == pytest.approx(8.0, abs=0.05)

@@ -75,9 +75,9 @@ def quiet(view: View) -> list[QualityFlag]:
     bins = np.arange(view.spectrum.shape[1]) * view.bin_hz
     band = np.abs(bins - view.frequency_hz) < BAND * view.frequency_hz
     # amplitude²/2 a bin, over the window's bandwidth of two bins
-    rest = float(np.sum(np.abs(view.spectrum[:, band].mean(axis=0)) ** 2)) / 4
-    share = own / max(own + rest, 1e-300)
-    if share > LINE_SHARE:
+    noise = np.abs(view.spectrum[:, band].mean(axis=0)) ** 2 / 4
+    share = own / max(own + float(np.sum(noise)), 1e-300)
+    if share > LINE_SHARE and own > SIGNIFICANT * float(np.mean(noise)):
         return []
     detail = (
         f"the strongest line, at {view.frequency_hz:.1f} Hz, has {100 * share:.0f} % of the power "
