@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from identify import dual
 from identify.dual import Dual
-from identify.newton import newton, slopes
+from identify.newton import add_held, newton, slopes
 from identify.polynomial import Polynomial
 from identify.structure import (
     Characteristic,
@@ -57,9 +57,9 @@ def _period(harmonics: int, samples: int | None = None) -> tuple[FloatArray, Com
 
 
 @lru_cache(maxsize=32)
-def _waves(harmonics: int) -> tuple[FloatArray, FloatArray]:
+def _waves(harmonics: int, samples: int | None = None) -> tuple[FloatArray, FloatArray]:
     """cos mτ and sin mτ, m = 0 … 2K, at the same time samples: (T, 2K + 1) each."""
-    samples = _period(harmonics)[0].shape[0]
+    samples = _period(harmonics, samples)[0].shape[0]
     angle = 2 * np.pi * np.outer(np.arange(samples), np.arange(2 * harmonics + 1)) / samples
     return np.cos(angle), np.sin(angle)
 
@@ -172,7 +172,7 @@ def _inputs_from_velocity(structure: Structure, values: Values, at: Conditions) 
         y = at_the_flame(structure.effects, values, at, s)
         y = np.where(np.isfinite(y), y, at.velocity)
         w = np.asarray(structure.flame_path(values, at, s) * y, dtype=complex)
-    return np.stack([w] + [y] * (structure.loops(values, at) - 1))
+    return np.stack([w] + [y] * (len(structure.characteristics(values, at)) - 1))
 
 
 def _newton(
@@ -332,13 +332,39 @@ def _slopes(N: Sequence[Characteristic], v: ComplexArray) -> Sequence[ComplexArr
 
 def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
     """∂N̂/∂x of one nonlinearity, (runs, K, 2K)."""
-    if isinstance(n, Preceded):  # an output depends on inputs of other times
-        back, forth = _period(K, FINE)
-        out = n.periodic(Dual(to_time(v, K, FINE), np.broadcast_to(back, (len(v), *back.shape))))
-        return np.asarray(forth @ dual.derivative(out, (len(v), FINE), 2 * K))
-    back, forth = _period(K)
-    slope = slope_along(n, to_time(v, K))
-    return np.asarray((forth[None] * slope[:, None, :]) @ back)
+    if not isinstance(n, Preceded):
+        return _from_slope(slope_along(n, to_time(v, K)), K)
+    x, own = to_time(v, K, FINE), np.arange(FINE)
+    # an output may follow the input of another time: its slope by both seeds says which
+    seeds = np.stack([np.ones(FINE), own], axis=1)
+    by_both = dual.derivative(
+        n.periodic(Dual(x, np.broadcast_to(seeds, (*x.shape, 2)))), x.shape, 2
+    )
+    slope, there = by_both[..., 0], by_both[..., 0] != 0
+    ratio = np.divide(by_both[..., 1], slope, out=np.zeros_like(slope), where=there)
+    followed = np.where(there & np.isfinite(ratio), np.rint(ratio), own).astype(np.int64)
+    moving = followed == own
+    out = _from_slope(slope * moving, K, FINE)
+    if not moving.all():
+        add_held(slope, followed, *_period(K, FINE), out)
+    return out
+
+
+def _from_slope(slope: FloatArray, K: int, samples: int | None = None) -> ComplexArray:
+    """∂N̂/∂x (runs, K, 2K) of a characteristic without memory from its slope (runs, T), by the
+    slope's Fourier coefficients as in `identify.newton`."""
+    k = np.arange(1, K + 1)
+    S = _orders(slope, K, samples)
+    gap, far = S[:, K - 1 + k[:, None] - k], S[:, K - 1 + k[:, None] + k]
+    return np.concatenate([gap + far, 1j * (gap - far)], axis=2)
+
+
+def _orders(slope: FloatArray, K: int, samples: int | None) -> ComplexArray:
+    """⟨N′ e^{−jmτ}⟩ of the orders m = 1 − K … 2K, (runs, 3K)."""
+    cosines, sines = _waves(K, samples)
+    re, im = slope @ cosines / len(cosines), slope @ sines / -len(sines)
+    below = slice(K - 1, 0, -1)  # of a real slope: the conjugates
+    return np.concatenate([re[:, below] - 1j * im[:, below], re + 1j * im], axis=1)
 
 
 def _jacobian(P: Sequence[Sequence[Any]], by_input: Sequence[ComplexArray], K: int) -> FloatArray:
@@ -376,12 +402,16 @@ def _differentiate(
         ds[free, :, p] = 1j * k
         s = Dual(s, ds)
     loop = structure.assemble(values, at, s)
-    v = orbits.inputs
-    forces = [_force(n, x, K) for n, x in zip(loop.N, v, strict=True)]
-    if all(isinstance(n, Polynomial) for n in loop.N):
-        by_input = _slopes(loop.N, v)
-    else:  # derivatives by inputs need a characteristic that carries none by parameters
-        by_input = _slopes(structure.assemble(plain_values, at, dual.value(s)).N, v)
+    v, shaping = orbits.inputs, structure.shaping
+    shaped = {**plain_values, **structure.parameters.seeded(vectors, runs_each, only=shaping)}
+    forces = []
+    for n, x in zip(structure.characteristics(shaped, at), v, strict=True):
+        force = _force(n, x, K)
+        d = np.zeros((runs, K, seeds), dtype=complex)
+        d[..., shaping] = dual.derivative(force, (runs, K), shaping.size)
+        forces.append(Dual(dual.value(force), d))
+    # derivatives by inputs need characteristics that carry none by parameters
+    by_input = _slopes(structure.characteristics(plain_values, at), v)
     R = _balance(loop, v, forces)
     explicit = np.stack([np.asarray(dual.derivative(r, (runs, K), seeds)) for r in R])
     right = np.concatenate([np.concatenate([x.real, x.imag], axis=1) for x in explicit], axis=1)

@@ -90,6 +90,29 @@ def slopes(curves, v, cosines, sines):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, error_model="numpy")
+def add_held(slope, followed, to_time, to_harmonics, out):  # type: ignore[no-untyped-def]
+    """Add to ∂N̂/∂x, `out` (rows, K, 2K), what comes of time samples that follow the input of
+    another sample; `slope` and `followed` (rows, T), matrices as of `identify.balance`."""
+    rows, T = slope.shape
+    K = out.shape[1]
+    total = np.zeros(K, dtype=np.complex128)
+    for r in range(rows):
+        source = -1  # what is held is held for a while: summed up until it lets go
+        for t in range(T + 1):
+            now = followed[r, t] if t < T and followed[r, t] != t else -1
+            if now != source:
+                if source >= 0:
+                    for k in range(K):
+                        for l in range(2 * K):
+                            out[r, k, l] += total[k] * to_time[source, l]
+                        total[k] = 0.0
+                source = now
+            if now >= 0:
+                for k in range(K):
+                    total[k] += to_harmonics[k, t] * slope[r, t]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def newton(P, Q, dP, dQ, curves, v, omega, cosines, sines, free, limit, tolerance):  # type: ignore[no-untyped-def]
     """Steps of every row from `v` (loops, rows, K), changed in place, as `omega` (rows,) is
     where `free` (rows,).

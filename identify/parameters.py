@@ -16,6 +16,7 @@ import numpy.typing as npt
 from identify import dual
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 
 EDGE = 1e-6  # of a bound: what is no farther from it has been stopped there
 
@@ -104,17 +105,22 @@ class ParameterSet:
     def slopes(self, internal: FloatArray) -> FloatArray:
         return np.array([p.slope(float(t)) for p, t in zip(self.parameters, internal, strict=True)])
 
-    def seeded(self, internal: FloatArray, rows: int, extra: int = 0) -> dict[str, Any]:
+    def seeded(
+        self, internal: FloatArray, rows: int, extra: int = 0, only: IntArray | None = None
+    ) -> dict[str, Any]:
         """Physical values as Duals, by name, for several vectors at once.
 
         `internal` is (vectors, p); each vector serves `rows` consecutive rows, so that values
-        have shape (vectors·rows, 1). `extra` more seed columns stay free at the end.
+        have shape (vectors·rows, 1). `extra` more seed columns stay free at the end. With `only`,
+        of these parameters alone, a seed each in their order.
         """
-        unit = np.eye(len(self), len(self) + extra)
+        chosen = np.arange(len(self)) if only is None else only
+        unit = np.eye(chosen.size, chosen.size + extra)
         columns = np.repeat(internal, rows, axis=0)
         return {
-            q.name: q.to_physical(dual.Dual(columns[:, j : j + 1], unit[j][None, None, :]))
-            for j, q in enumerate(self.parameters)
+            q.name: q.to_physical(dual.Dual(columns[:, j : j + 1], unit[i][None, None, :]))
+            for i, j in enumerate(chosen)
+            for q in [self.parameters[j]]
         }
 
     def plain(self, internal: FloatArray, rows: int = 0) -> dict[str, Any]:

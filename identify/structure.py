@@ -393,21 +393,13 @@ class Structure:
                 y = e.sensor(p, at, s, y)
             return y
 
-        n = self._characteristic(p)
-        for e in self.effects:
-            n = e.characteristic(p, n, at)
-        for e in self.effects:
-            if (operator := e.operator(p)) is not None:
-                n = Preceded(n, operator)
-        losses = self._losses(p, at, modes)
-        if not losses:
+        n = self._flame_characteristic(p, at)
+        loss = self._loss(p, at, modes)
+        if loss is None:
             q = H * (from_drive * drive)
             return Loop(
                 ((H * at_flame,),), (q,), (seen_flame,), seen_drive * drive, (n,), sensor, H
             )
-        if len(losses) > 1:
-            raise ValueError("two effects declare an amplitude-dependent loss; one at most")
-        loss = losses[0]
         lossy = -response(resonators, loss.coefficients)
         felt = [b * w for b, w in zip(resonators, loss.weights, strict=True)]
         row = (response(felt, by_flame) * s * on, -response(felt, loss.coefficients))
@@ -422,9 +414,26 @@ class Structure:
             H,
         )
 
-    def loops(self, p: Values, at: Conditions) -> int:
-        """How many nonlinearities the equations have."""
-        return 1 + len(self._losses(p, at, self._modes(p, at)))
+    def characteristics(self, p: Values, at: Conditions) -> tuple[Characteristic, ...]:
+        """Those of `assemble` alone: all nonlinearities of the equations."""
+        loss = self._loss(p, at, self._modes(p, at))
+        own = () if loss is None else (loss.characteristic,)
+        return (self._flame_characteristic(p, at), *own)
+
+    @cached_property
+    def shaping(self) -> npt.NDArray[np.int64]:
+        """Which of the parameters shape the characteristics: no other reaches them but by their
+        inputs."""
+        bent = {q.name for q in _characteristic_parameters(self)}
+        for e in self.effects:
+            hooks = (
+                (type(e).characteristic, Effect.characteristic),
+                (type(e).operator, Effect.operator),
+                (type(e).loss, Effect.loss),
+            )
+            if any(own is not none for own, none in hooks):
+                bent |= {q.name for q in e.parameters}
+        return np.flatnonzero([n in bent for n in self.parameters.names])
 
     def _modes(self, p: Values, at: Conditions) -> list[Mode]:
         modes = declared_modes(p, self.mode_count)
@@ -440,8 +449,20 @@ class Structure:
             raise ValueError("two effects declare a branch beside the tube; one at most")
         return found[0] if found else None
 
-    def _losses(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Loss]:
-        return [x for e in self.effects if (x := e.loss(p, at, modes)) is not None]
+    def _loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss | None:
+        found = [x for e in self.effects if (x := e.loss(p, at, modes)) is not None]
+        if len(found) > 1:
+            raise ValueError("two effects declare an amplitude-dependent loss; one at most")
+        return found[0] if found else None
+
+    def _flame_characteristic(self, p: Values, at: Conditions) -> Characteristic:
+        n = self._characteristic(p)
+        for e in self.effects:
+            n = e.characteristic(p, n, at)
+        for e in self.effects:
+            if (operator := e.operator(p)) is not None:
+                n = Preceded(n, operator)
+        return n
 
     def flame_path(self, p: Values, at: Conditions, s: Any) -> Any:
         """From the velocity at the flame to the nonlinearity's input."""

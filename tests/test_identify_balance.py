@@ -95,6 +95,24 @@ def test_derivatives_agree_with_differences(free: bool) -> None:
         assert error < 2e-4 * size, structure.parameters.names[j]
 
 
+@pytest.mark.parametrize("form", ["dead_zone", "hysteresis", "tanh"])
+def test_slopes_of_what_is_sampled_agree_with_differences(form: str) -> None:
+    """Corners, and a play that holds its output for half of each period."""
+    effect = by_key(f"nonlinearity_shape:{form}")
+    rng = np.random.default_rng(3)
+    v = rng.normal(size=(2, K)) * 3000 / np.arange(1, K + 1) + 1j * rng.normal(size=(2, K)) * 300
+    size = 1 / 4000 if form == "tanh" else 800.0
+    values = {**true_values(), effect.parameters[0].name: size}
+    (n,) = Structure(effects=(effect,)).characteristics(values, forced_conditions())
+    exact = balance._force_jacobian(n, v, K)
+    for j in range(2 * K):
+        h = np.zeros(K, dtype=complex)
+        h[j % K] = 1e-4 if j < K else 1e-4j
+        up, down = balance._force(n, v + h, K), balance._force(n, v - h, K)
+        # corners move by less than a sample of 1024: no sample changes sides but by chance
+        np.testing.assert_allclose((up - down) / 2e-4, exact[:, :, j], atol=2e-6)
+
+
 def test_several_vectors_at_once_equal_one_by_one() -> None:
     structure = Structure()
     at = forced_conditions()
@@ -131,13 +149,17 @@ def test_compiled_and_sampled_newton_find_the_same_orbits(
     both = np.stack([vector, vector * np.r_[np.full(vector.size - 1, 1.0002), 2.0]])
     at = free_conditions() if free else forced_conditions()
     compiled = balance.solve(structure, both, at, derivatives=True)
-    own = Structure.assemble
+    assemble, characteristics = Structure.assemble, Structure.characteristics
 
     def hidden(self: Structure, *arguments: Any) -> Loop:
-        loop = own(self, *arguments)
+        loop = assemble(self, *arguments)
         return replace(loop, N=tuple(Opaque(n) for n in loop.N))
 
+    def hidden_too(self: Structure, *arguments: Any) -> tuple[Characteristic, ...]:
+        return tuple(Opaque(n) for n in characteristics(self, *arguments))
+
     monkeypatch.setattr(Structure, "assemble", hidden)
+    monkeypatch.setattr(Structure, "characteristics", hidden_too)
     sampled = balance.solve(structure, both, at, derivatives=True)
     assert compiled.converged.all()
     assert sampled.converged.all()
