@@ -9,6 +9,9 @@ the velocity. What the harmonics leave is noise, and its spectrum within a few h
 the covariance of c_k, across harmonics too, because jitter of phase or amplitude correlates them.
 A coarse converter adds what these neighbours do not show (`identify.quantisation`).
 
+No microphone, amplifier and converter are together more linear than a part in a million, whatever
+their noise: that share of the fundamental counts in every harmonic.
+
 Foreign tones that are known are fitted beside the harmonics, so that they leak into none. One that
 stands on a harmonic cannot be told from it: its size counts there as noise.
 """
@@ -31,6 +34,7 @@ SIDE_BINS = 20  # neighbours on either side that give a coefficient's noise
 VARIANCE_DOF = 4 * SIDE_BINS  # real degrees of freedom behind each estimated variance
 SEGMENTS = 256  # a record's demodulated signal is averaged to this many points
 APART_BINS = 2.0  # a tone nearer to a harmonic cannot be fitted beside it
+DISTORTION = 1e-6  # of the fundamental in each harmonic: the best of recording chains, −120 dB
 NO_TONES: Mapping[float, float] = MappingProxyType({})
 
 
@@ -205,7 +209,9 @@ def measure(
     reference_c = velocity[0] if run.kind == "free" else drive_c[0]
     turn = np.exp(-1j * np.angle(reference_c) * k)
     noise = noise * turn
-    covariance = coefficient_covariance(noise) + np.diag(np.tile(coarse + covered, 2) / 2)
+    distorted = (DISTORTION * np.abs(velocity[0])) ** 2
+    beside = coarse + covered + distorted
+    covariance = coefficient_covariance(noise) + np.diag(np.tile(beside, 2) / 2)
     stderr = 0.0
     if run.kind == "free":
         both = slice(0, len(inputs))
