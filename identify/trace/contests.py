@@ -51,10 +51,16 @@ NEAR = 100.0  # … that leave no more than so much χ²/dof …
 BEHIND = 3.0  # … and, where forms of a better one explain the data, than so many times its χ²
 
 
-def part_of(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
-    """The values of `t` with some of its effects, not fitted again: as loud as with all."""
+def part_of(
+    t: Tried,
+    effects: tuple[Effect, ...],
+    data: Dataset,
+    values: Mapping[str, float] | None = None,
+) -> Fit:
+    """The values of `t`, or those given, with some of its effects, not fitted again: as loud as
+    with all."""
     structure = replace(t.fit.structure, effects=effects)
-    names, values = structure.parameters.names, t.fit.values
+    names, values = structure.parameters.names, values or t.fit.values
     gone = [e for e in t.effects if e not in effects]
     theta = structure.parameters.to_internal([values[n] for n in names])
     theta = louder(theta, names, loudness(data, gone, values))
@@ -68,28 +74,29 @@ def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     known = [t.fit.values]
     for e in t.effects:
         if e not in effects:
-            known += _with_a_mode_less(e, replace(smaller, effects=()), t.fit.values)
+            known += _named_otherwise(e, t)
     thetas = np.stack([smaller.parameters.to_internal([p[n] for n in names]) for p in known])
     return fit_orbits(smaller, data, thetas, continuation=(0.003, 0.0))
 
 
-def _with_a_mode_less(
-    gone: Effect, plain: Structure, values: Mapping[str, float]
-) -> list[dict[str, float]]:
-    """Values without an effect that adds a mode, of which it has the name only: any of those that
-    do not sing may be the one too many."""
-    richer, count = gone.restated(plain), plain.mode_count
+def _named_otherwise(effect: Effect, t: Tried) -> list[dict[str, float]]:
+    """The values of `t` with another mode in the place of the one that `effect` adds, of which it
+    has the name only: any of those that do not sing may be the one too many."""
+    values, plain = t.fit.values, replace(t.fit.structure, effects=())
+    richer, count = effect.restated(plain), plain.mode_count
     if richer is None or richer.mode_count != count + 1:
         return []
-    full = {**values, **gone.to_restated(plain, values)}
+    full = {**values, **effect.to_restated(plain, values)}
     out = []
-    for left_out in range(2, count + 1):
-        stay = [i for i in range(1, count + 2) if i != left_out]
+    for added in range(2, count + 1):
+        stay = [i for i in range(1, count + 2) if i != added]
         moved = {
             f"mode{new}.{kind}": full[f"mode{old}.{kind}"]
             for new, old in enumerate(stay, start=1)
             for kind in MODAL
         }
+        for q, kind in zip(effect.parameters, MODAL, strict=True):
+            moved[q.name] = full[f"mode{added}.{kind}"]
         out.append({**values, **moved})
     return out
 
@@ -183,14 +190,15 @@ def _in_form(item: _Exchange) -> Fit | None:
     """`t` with one of its effects in another form, or another effect in its place, beside those
     kept; None where none starts."""
     t, kept, old, form, data = item
-    base = part_of(t, kept, data)
-    larger = base.structure.with_effects(form)
+    larger = replace(t.fit.structure, effects=(*kept, form))
 
-    def start(row: Sequence[float]) -> FloatArray:
+    def start(row: Sequence[float], values: Mapping[str, float]) -> FloatArray:
+        base = part_of(t, kept, data, values)
         others = beside(base.structure, base.theta, data, form, row)
         return np.concatenate([others, form.to_internal(row)])
 
-    taken = [start(row) for row in form.starts_from(old, t.fit.values)]
+    known = [t.fit.values, *_named_otherwise(old, t)]
+    taken = [start(row, values) for values in known for row in form.starts_from(old, values)]
     if form.refines:
         fits = [
             fit_orbits(larger, data, theta, continuation=(0.003, 0.0), iterations=REFINED)
@@ -198,7 +206,7 @@ def _in_form(item: _Exchange) -> Fit | None:
             if (theta := matched(larger, row, t.fit, data)) is not None
         ]
         return min(fits, key=lambda f: f.chi2, default=None)
-    rows = [start(row) for row in form.starts(known_sizes(data, t.fit))]
+    rows = [start(row, t.fit.values) for row in form.starts(known_sizes(data, t.fit))]
     starts = coarse(larger, data, [*rows, *taken])[:2]
     fits = []
     if starts:
@@ -237,10 +245,10 @@ def matched(larger: Structure, theta: FloatArray, fit: Fit, data: Dataset) -> Fl
         return np.asarray(np.nan_to_num(both, nan=1e6, posinf=1e6, neginf=-1e6))
 
     low, high = (np.asarray(limit)[free] for limit in larger.parameters.bounds())
-    near = np.array([larger.parameters.parameters[i].kind == "positive" for i in free])
-    low = np.where(near, np.maximum(low, theta[free] - NEARBY), low)
-    high = np.where(near, np.minimum(high, theta[free] + NEARBY), high)
     begin = np.clip(theta[free], low + 1e-9, high - 1e-9)
+    near = np.array([larger.parameters.parameters[i].kind == "positive" for i in free])
+    low = np.where(near, np.maximum(low, begin - NEARBY), low)
+    high = np.where(near, np.minimum(high, begin + NEARBY), high)
     found = least_squares(difference, begin, bounds=(low, high), x_scale="jac", max_nfev=150)
     if not np.sqrt(np.mean(found.fun**2)) < 0.1:
         return None

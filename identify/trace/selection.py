@@ -22,6 +22,7 @@ from identify.trace.contests import (
     in_their_places,
     joins,
     led_on,
+    part_of,
     reformed,
     runners_up,
     settled,
@@ -243,23 +244,27 @@ class _Searching:
 
     def with_chance(self, parents: Sequence[Tried]) -> None:
         """Run-to-run scatter beside each of `parents`, and effects beside scatter."""
+        data, run = self.data, self.run
         self.report(0.6, "trying run-to-run scatter beside an effect")
         good = [t for t in self.tried if t.explains]
+        by_law = [t for t in good if t.spread is None]
         for parent in parents:
-            if good and parent.names[0] not in best_form(good).names:
+            if by_law and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
             found = self._scattered(parent.fit.structure, parent.fit)
-            found += _simpler_beside_chance(found, self.data, self.apart, self.run)
-            self.tried += [*found, *_without_chance(found, self.data)]
-        if not self.explained:
+            found += _simpler_beside_chance(found, data, self.apart, run)
+            self._add_beside_chance(found)
+        if not by_law:
             alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
-            found = _beside_chance(alone, self.data, self.apart, self.run)
-            self.tried += [*found, *_without_chance(found, self.data)]
+            self._add_beside_chance(_beside_chance(alone, data, self.apart, run))
         for share in SOFTENED:
             if not self.explained and _least(self.tried) > MUCH:
                 self._from_softened(share)
         if not self.explained:
-            self.tried += _in_the_place_of_chance(self.tried, self.data, self.apart, self.run)
+            found = _other_forms_beside_chance(self.tried, data, self.apart, run)
+            self._add_beside_chance(found)
+        if not self.explained:
+            self.tried += _in_the_place_of_chance(self.tried, data, self.apart, run)
 
     def _from_softened(self, share: float) -> None:
         """An effect and chance that are both gross lead each other astray. Where noise of such a
@@ -280,7 +285,20 @@ class _Searching:
         spreads = try_scatters(self.structure, soft, base, self.scatters, run)
         found += _beside_chance(spreads, data, self.apart, run)
         found += _simpler_beside_chance(found, data, self.apart, run)
-        self.tried += [*found, *_without_chance(found, data)]
+        self._add_beside_chance(found)
+
+    def _add_beside_chance(self, found: Sequence[Tried]) -> None:
+        """Sets with a spread, and what is left of those that come to the noise without it, and of
+        the first of them without the law: from where they ended, either may not be needed."""
+        self.tried += [*found, *_without_chance(found, self.data)]
+        known = {t.effects[-1].key for t in self.tried if t.spread and len(t.effects) == 1}
+        for t in found:
+            chance = t.effects[-1]
+            if t.adequate and len(t.effects) == 2 and chance.key not in known:
+                assert isinstance(chance, Scatter)
+                known.add(chance.key)
+                base = part_of(t, (), self.data)
+                self.tried += try_scatters(base.structure, self.data, base, [chance], self.run)
 
     def _scattered(self, structure: Structure, base: Fit) -> list[Tried]:
         """Run-to-run scatter on top of `structure`; beside what explains the data already, as far
@@ -377,21 +395,44 @@ def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
 def _simpler_beside_chance(
     tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
 ) -> list[Tried]:
-    """The simpler forms of laws that explain the data with a spread beside them: which form was
+    """The simpler forms of laws that come to the noise with a spread beside them: which form was
     nearest without it, the scattered runs decided."""
     out: list[Tried] = []
     for t in tries:
-        if not t.explains:
-            continue
-        chance = t.effects[-1]
-        assert isinstance(chance, Scatter)
-        assert t.spread is not None
-        law = tried(t.fit.structure.effects, t.fit, t.spread.data)
-        most = {e.name: len(e.parameters) for e in law.effects}
-        forms = [e for e in available if len(e.parameters) < most.get(e.name, 0)]
-        for simpler in in_each_form(law, t.spread.data, forms, run):
-            if simpler.adequate:
-                out += try_scatters(simpler.fit.structure, data, simpler.fit, [chance], run)
+        if t.adequate:
+            most = {e.name: len(e.parameters) for e in t.effects}
+            forms = [e for e in available if len(e.parameters) < most.get(e.name, 0)]
+            out += _in_forms_beside_chance(t, data, forms, run)
+    return out
+
+
+def _other_forms_beside_chance(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """The other forms of the law that comes nearest to the noise with a spread beside it, where
+    none explains the data: a spread that looks like no chance may follow what its form lacks."""
+    both = [t for t in tries if t.spread and len(t.effects) == 2]
+    best = min(both, key=lambda t: (not t.adequate, misfit(t)), default=None)
+    if best is None or best.fit.chi2_per_dof > LITTLE:
+        return []
+    found = _in_forms_beside_chance(best, data, available, run)
+    return [*found, *_simpler_beside_chance(found, data, available, run)]
+
+
+def _in_forms_beside_chance(
+    t: Tried, data: Dataset, forms: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """Some other forms of the laws of `t`, beside the same spread."""
+    chance = t.effects[-1]
+    assert isinstance(chance, Scatter)
+    assert t.spread is not None
+    wide = t.spread.data
+    law = tried(t.fit.structure.effects, t.fit, wide)
+    others = in_each_form(law, wide, forms, run)
+    near = [o for o in others if o.adequate or misfit(o) < misfit(law)]
+    out: list[Tried] = []
+    for o in near:
+        out += try_scatters(o.fit.structure, data, o.fit, [chance], run)
     return out
 
 
