@@ -20,10 +20,15 @@ from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
-from identify.trace.contests import eliminate, in_other_forms, settled
+from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
 from identify.trace.places import shaped, whereabouts
 from identify.trace.scores import scan
-from identify.trace.selection import against_chance, try_scatters
+from identify.trace.selection import (
+    _other_forms_beside_chance,
+    _without_law,
+    against_chance,
+    try_scatters,
+)
 from identify.trace.stages import known_sizes
 from identify.trace.tried import tried
 from simulated_rig import build_config
@@ -433,6 +438,16 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     assert excess[1] < 0.4 * excess[0]
     assert found.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(231.0, abs=3.0)
     assert mode.fit.values["acoustic_mode.frequency_hz"] < 225.0
+    # a further mode goes by the smallest part in the response: the resonator may be a declared one
+    structure = mode.fit.structure
+    (other,) = _named_otherwise(mode.effects[0], mode)
+    assert other["mode2.frequency_hz"] == mode.fit.values["acoustic_mode.frequency_hz"]
+    theta = structure.parameters.to_internal([other[n] for n in structure.parameters.names])
+    same = fit_orbits(structure, ready.data, theta, continuation=(0.0,), iterations=0)
+    assert same.chi2 == pytest.approx(mode.fit.chi2, rel=1e-6)
+    renamed = replace(mode, fit=same)
+    (again,) = in_other_forms([renamed], ready.data, [side], InProcess())
+    assert again.fit.chi2 == pytest.approx(found.fit.chi2, rel=1e-2)
 
 
 def test_held_out_runs_have_a_say_in_what_is_needed(tmp_path: Path) -> None:
@@ -704,6 +719,44 @@ def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
     change = best.estimates["parameter_drift.relative_change"]
     over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
     assert abs(change.value - 0.02 * over) < 4 * change.stderr
+
+
+def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:
+    """From a declared fit that chance has led astray, chance alone may lead nowhere."""
+    scatter = {"gain_rms": 0.005, "phase_rms_rad": 0.005}
+    ready = thesis_campaign(tmp_path, 7, {"drive_scatter": scatter}, noise_db=80.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    lag = by_key("actuator_dynamics:pole")
+    larger = ready.structure.with_effects(lag)
+    begun = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0], iterations=5)
+    both = try_scatters(larger, ready.data, begun, [DRIVE], InProcess())
+    assert both[0].adequate
+    (alone,) = _without_law(both, (), ready.data, InProcess())
+    assert alone.explains
+    assert alone.key_of_forms == ("drive_scatter",)
+    declared, found = tried((), base, ready.data), [*both, alone]
+    assert [trace.accounts(t, declared, found) for t in found] == [False, True]
+    assert _without_law(both, {("drive_scatter",)}, ready.data, InProcess()) == []
+
+
+def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
+    """The drive's cubic term taken for a quadratic one leaves what no scatter of the drive is."""
+    effects = {
+        "actuator_nonlinearity/compression": {"cubic_per_v2": 0.02},
+        "drive_scatter": {"gain_rms": 0.003, "phase_rms_rad": 0.003},
+    }
+    ready = thesis_campaign(tmp_path, 7, effects, noise_db=60.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    wrong, right = (by_key(f"actuator_nonlinearity:{form}") for form in ("quadratic", "cubic"))
+    larger = ready.structure.with_effects(wrong)
+    begun = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0])
+    both = try_scatters(larger, ready.data, begun, [DRIVE], InProcess())
+    assert not both[0].explains
+    found = _other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
+    best = trace.best_form([t for t in found if t.explains])
+    assert best.key_of_forms == ("actuator_nonlinearity:cubic", "drive_scatter")
+    a3 = best.estimates["actuator_nonlinearity.a3"]
+    assert abs(a3.value + 0.02) < 4 * a3.stderr
 
 
 @pytest.mark.parametrize(

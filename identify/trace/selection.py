@@ -1,6 +1,6 @@
 """The search: singles, run-to-run scatter, pairs and triples, and what contests them."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -288,17 +288,11 @@ class _Searching:
         self._add_beside_chance(found)
 
     def _add_beside_chance(self, found: Sequence[Tried]) -> None:
-        """Sets with a spread, and what is left of those that come to the noise without it, and of
-        the first of them without the law: from where they ended, either may not be needed."""
+        """Sets with a spread, and what is left of those that come to the noise without it, and
+        without the law: from where they ended, either may not be needed."""
         self.tried += [*found, *_without_chance(found, self.data)]
-        known = {t.effects[-1].key for t in self.tried if t.spread and len(t.effects) == 1}
-        for t in found:
-            chance = t.effects[-1]
-            if t.adequate and len(t.effects) == 2 and chance.key not in known:
-                assert isinstance(chance, Scatter)
-                known.add(chance.key)
-                base = part_of(t, (), self.data)
-                self.tried += try_scatters(base.structure, self.data, base, [chance], self.run)
+        known = {t.key_of_forms for t in self.tried if t.spread}
+        self.tried += _without_law(found, known, self.data, self.run)
 
     def _scattered(self, structure: Structure, base: Fit) -> list[Tried]:
         """Run-to-run scatter on top of `structure`; beside what explains the data already, as far
@@ -389,6 +383,21 @@ def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
             fit = min(fits, key=lambda f: f.chi2)
             if np.isfinite(fit.chi2):
                 out.append(tried(t.fit.structure.effects, fit, data))
+    return out
+
+
+def _without_law(
+    tries: Sequence[Tried], known: Collection[tuple[str, ...]], data: Dataset, run: Executor
+) -> list[Tried]:
+    """Spreads alone, from where the first effect ended that comes to the noise beside each of them,
+    but for those `known`: from the declared fit they may have led nowhere."""
+    out: list[Tried] = []
+    for t in first_of_each([t for t in tries if t.adequate], lambda t: t.effects[-1].key).values():
+        chance = t.effects[-1]
+        assert isinstance(chance, Scatter)
+        if (chance.key,) not in known:
+            base = part_of(t, (), data)
+            out += try_scatters(base.structure, data, base, [chance], run)
     return out
 
 
