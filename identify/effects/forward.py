@@ -247,17 +247,19 @@ class NonlinearDamping(Effect):
         return Loss([beta] * count, characteristic, [1.0] * count)
 
 
+MODE_COUNTS = (2, 3, 4)  # of models for which there are forms with a share of each mode
+
 EFFECTS: tuple[Effect, ...] = (
     AcousticMode(),
     AcousticMode("two_modes", 2),
     SideResonator(),
-    *(SideResonator(n) for n in (2, 3)),
+    *(SideResonator(n) for n in MODE_COUNTS),
     NonlinearDamping("quadratic"),
     NonlinearDamping("quadratic_mode"),
     NonlinearDamping("cubic"),
     NonlinearDamping("cubic_mode"),
-    *(NonlinearDamping(f"{law}_end", n) for law in LOSSES for n in (2, 3)),
+    *(NonlinearDamping(f"{law}_end", n) for law in LOSSES for n in MODE_COUNTS),
     NonlinearDamping("quadratic_cubic"),
     NonlinearDamping("quadratic_cubic_mode"),
-    *(NonlinearDamping("quadratic_cubic_end", n) for n in (2, 3)),
+    *(NonlinearDamping("quadratic_cubic_end", n) for n in MODE_COUNTS),
 )

@@ -133,7 +133,7 @@ class _Searching:
     run: Executor
     report: Progress
     available: tuple[Effect, ...]
-    fuller: tuple[Effect, ...]  # forms for one mode more, beside an effect that brings it
+    fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them
     scatters: tuple[Scatter, ...]
     tried: list[Tried] = field(default_factory=list)
     extended: dict[tuple[str, ...], float] = field(default_factory=dict)  # grown from, χ² there …
@@ -575,11 +575,14 @@ def refitted(tries: Sequence[Tried], data: Dataset, keep: int = 6) -> list[Tried
 
 
 def _fuller(catalogue: Sequence[Effect], data: Dataset, structure: Structure) -> tuple[Effect, ...]:
-    """Forms for one mode more than declared that are not there for the declared ones."""
-    more = replace(structure, mode_count=structure.mode_count + 1)
+    """Forms for one mode or two more than declared that are not there for the declared ones."""
     known = {e.key for e in catalogue if usable(e, data, structure)}
-    found = [e for e in catalogue if e.mode_count is not None and usable(e, data, more)]
-    return tuple(e for e in found if e.key not in known and not e.refines)
+    out: list[Effect] = []
+    for added in (1, 2):
+        more = replace(structure, mode_count=structure.mode_count + added)
+        found = (e for e in catalogue if e.mode_count is not None and usable(e, data, more))
+        out += [e for e in found if e.key not in known and not e.refines]
+    return tuple(out)
 
 
 def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
