@@ -14,7 +14,7 @@ from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.identification import prepare
 from identify.scatter import fit_scatter
-from identify.trace.contests import in_their_places, joins, reformed
+from identify.trace.contests import in_their_places, joins, matched, reformed
 from identify.trace.tried import tried
 from tests.trace_material import campaign, fitted, only, thesis_campaign, tried_as
 
@@ -86,6 +86,30 @@ def test_what_stands_in_another_s_place_beside_a_gross_effect(tmp_path: Path) ->
     best = min(found, key=lambda t: t.fit.chi2)
     assert best.key == ("acoustic_mode", "actuator_dynamics")
     assert best.explains
+
+
+def test_a_law_starts_where_it_answers_as_another_does(tmp_path: Path) -> None:
+    """A spread of delays that a flame of second order explains: from thrice as long a delay, too
+    far for a fit at little noise, its response is brought to that one's first."""
+    late = {"flame_dynamics/distributed_delay": {"mean_delay_s": 2.5e-4}}
+    ready = thesis_campaign(tmp_path, 5, late, noise_db=95.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    first = only(ready, base, "flame_dynamics:second_order").fit
+    form = by_key("flame_dynamics:distributed_delay")
+    larger = ready.structure.with_effects(form)
+    far = np.r_[first.theta[: len(ready.structure.parameters)], form.to_internal((7.5e-4, 3e-4))]
+    lost = fit_orbits(larger, ready.data, far, continuation=(0.0,), iterations=30)
+    assert not tried((form,), lost, ready.data).explains
+    alike = matched(larger, far, first, ready.data, moving="flame.")
+    assert alike is not None
+    assert larger.parameters.plain(alike)["flame_dynamics.delay_s"] == pytest.approx(
+        2.5e-4, rel=0.2
+    )
+    fit = fit_orbits(larger, ready.data, alike, continuation=(0.0,), iterations=30)
+    found = tried((form,), fit, ready.data)
+    assert found.explains
+    delay = found.estimates["flame_dynamics.delay_s"]
+    assert abs(delay.value - 2.5e-4) < 4 * delay.stderr
 
 
 def test_a_law_far_likelier_whose_values_are_not_known_is_a_rival(

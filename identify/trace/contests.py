@@ -42,6 +42,7 @@ TOGETHER = ("nonlinearity_shape", "actuator_nonlinearity")  # of which two laws 
 UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
 SETTLED = 16  # of the nearest of them are led on
 RUNNERS_UP = 2  # sets whose other forms are tried for that
+LINEAR = ("flame", "actuator")  # places whose effects are responses that others may be like
 NEARBY = 0.7  # of the logarithm, where another form is matched
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
 LED_ON = 4  # of the best of a level that had not converged …
@@ -207,6 +208,9 @@ def _in_form(item: _Exchange) -> Fit | None:
         ]
         return min(fits, key=lambda f: f.chi2, default=None)
     rows = [start(row, t.fit.values) for row in form.starts(known_sizes(data, t.fit))]
+    if form.location in LINEAR and form.location == old.location:
+        alike = [matched(larger, row, t.fit, data, moving="flame.") for row in rows]
+        taken += [theta for theta in alike if theta is not None]
     starts = coarse(larger, data, [*rows, *taken])[:2]
     fits = []
     if starts:
@@ -217,12 +221,15 @@ def _in_form(item: _Exchange) -> Fit | None:
     return min(fits, key=lambda f: f.chi2, default=None)
 
 
-def matched(larger: Structure, theta: FloatArray, fit: Fit, data: Dataset) -> FloatArray | None:
-    """Unknowns of `larger` with whose acoustics it responds as `fit` does at the measured
-    harmonics, from `theta`; None where they cannot be brought within a tenth."""
+def matched(
+    larger: Structure, theta: FloatArray, fit: Fit, data: Dataset, moving: str = "mode"
+) -> FloatArray | None:
+    """Unknowns of `larger` with which it responds as `fit` does at the measured harmonics, from
+    `theta`: its last effect's, and those whose names begin with `moving`, which stay nearby. None
+    where the responses cannot be brought within a tenth."""
     names = larger.parameters.names
     own = {q.name for q in larger.effects[-1].parameters}
-    free = [i for i, n in enumerate(names) if n.startswith("mode") or n in own]
+    free = [i for i, n in enumerate(names) if n.startswith(moving) or n in own]
 
     def responses(structure: Structure, values: Mapping[str, float]) -> ComplexArray:
         parts = []
@@ -230,7 +237,7 @@ def matched(larger: Structure, theta: FloatArray, fit: Fit, data: Dataset) -> Fl
             at = replace(b.at, drive=np.ones_like(b.at.drive))
             s = 1j * at.omega[:, None] * np.arange(1, at.drive.shape[1] + 1)
             loop = structure.assemble(values, at, s)
-            parts += [np.broadcast_to(x, s.shape).ravel() for x in (loop.G[0], loop.G_u)]
+            parts += [np.broadcast_to(x, s.shape).ravel() for x in (loop.G[0], loop.G_u, loop.H)]
         return np.concatenate(parts)
 
     target = responses(fit.structure, fit.values)
@@ -246,7 +253,9 @@ def matched(larger: Structure, theta: FloatArray, fit: Fit, data: Dataset) -> Fl
 
     low, high = (np.asarray(limit)[free] for limit in larger.parameters.bounds())
     begin = np.clip(theta[free], low + 1e-9, high - 1e-9)
-    near = np.array([larger.parameters.parameters[i].kind == "positive" for i in free])
+    near = np.array(
+        [larger.parameters.parameters[i].kind == "positive" and names[i] not in own for i in free]
+    )
     low = np.where(near, np.maximum(low, begin - NEARBY), low)
     high = np.where(near, np.minimum(high, begin + NEARBY), high)
     found = least_squares(difference, begin, bounds=(low, high), x_scale="jac", max_nfev=150)
