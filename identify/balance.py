@@ -179,28 +179,38 @@ def _newton(
     structure: Structure, p: Values, at: Conditions, start: ComplexArray, limit: IntArray
 ) -> Orbits:
     K, free = at.harmonics, at.free
-    v, omega, left = start.copy(), at.omega.copy(), limit
+    v, omega = start.copy(), at.omega.copy()
     if free.any():
         v[:, free] *= np.exp(-1j * np.angle(v[0, free, :1]) * np.arange(1, K + 1))
+    error, predicted = np.full(at.runs, np.inf), np.empty((at.runs, K), dtype=complex)
+    rows, left = np.arange(at.runs), limit
     with np.errstate(all="ignore"):
-        while True:
-            loop, terms = _assembled(structure, p, at, omega, len(v))
-            if all(isinstance(n, Polynomial) for n in loop.N):
-                curves = _tables(loop.N, at.runs)
-                cosines, sines = _waves(K)
-                error, taken, forces = newton(
-                    *terms, curves, v, omega, cosines, sines, free, left, TOLERANCE
-                )
-            else:
-                v, omega, error, taken, forces = _sampled_newton(
-                    loop.N, terms, v, omega, free, left
-                )
-            left = np.where(free, left - taken, 0)
-            if not taken[free].any():  # solved where it was assembled
-                break
-        predicted = np.asarray(dual.value(_velocity(loop, forces)))
+        while rows.size:
+            loop, terms = _assembled(structure, p, at, omega[rows], len(v))
+            found = _solved(loop.N, terms, v[:, rows], omega[rows], at.free, left)
+            v[:, rows], omega[rows], error[rows], taken, forces = found
+            predicted[rows] = dual.value(_velocity(loop, forces))
+            again = np.flatnonzero(at.free & (taken > 0))  # the others were solved where assembled
+            rows, left, at = rows[again], (left - taken)[again], at.take(again)
+            p = {n: x[again] for n, x in p.items()}
     converged = (error < 1e-8) & np.isfinite(predicted).all(axis=1)
     return Orbits(v, predicted, omega, converged)
+
+
+def _solved(
+    N: Sequence[Characteristic],
+    terms: "_Terms",
+    v: ComplexArray,
+    omega: FloatArray,
+    free: BoolArray,
+    left: IntArray,
+) -> tuple[ComplexArray, FloatArray, FloatArray, IntArray, ComplexArray]:
+    """Inputs, frequencies, relative residuals, steps taken and N̂ with the terms as they are."""
+    if not all(isinstance(n, Polynomial) for n in N):
+        return _sampled_newton(N, terms, v, omega, free, left)
+    curves, waves = _tables(N, omega.size), _waves(v.shape[2])
+    found = newton(*terms, curves, v, omega, *waves, free, left, TOLERANCE)
+    return v, omega, *found
 
 
 @dataclass(frozen=True)

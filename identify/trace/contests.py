@@ -302,14 +302,16 @@ def _in_all_forms(
     run: Executor,
     done: set[tuple[str, ...]],
 ) -> list[Tried]:
-    """A set of effects in their other forms, one effect after the other while that brings gain."""
+    """A set of effects in their other forms, one effect after the other while that brings gain;
+    what was tried on the way is not tried again."""
     out: list[Tried] = []
-    current = first
+    current, seen = first, {first.key_of_forms}
     for _ in first.effects:
         if current.key_of_forms in done:
             break
-        found = in_each_form(current, data, available, run)
+        found = in_each_form(current, data, available, run, seen)
         done.add(current.key_of_forms)
+        seen |= {t.key_of_forms for t in found}
         out += found
         best = min(found, key=misfit, default=current)
         if best.explains or best.fit.chi2 >= current.fit.chi2 - EVIDENCE:
