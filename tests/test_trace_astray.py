@@ -14,9 +14,11 @@ from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.identification import prepare
 from identify.scatter import fit_scatter
-from identify.trace.contests import in_their_places, joins, matched, reformed
+from identify.trace.contests import in_each_form, in_their_places, joins, matched, reformed
 from identify.trace.tried import tried
-from tests.trace_material import campaign, fitted, only, thesis_campaign, tried_as
+from simulated_rig.effects import make_effect
+from simulated_rig.random_rigs import random_rig
+from tests.trace_material import campaign, fitted, only, record, thesis_campaign, tried_as
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -186,3 +188,47 @@ def test_other_forms_of_what_leaves_a_gross_misfit(tmp_path: Path) -> None:
     assert set(right.key_of_forms) == wanted
     assert right.estimates["actuator_nonlinearity.level_v"].value == pytest.approx(1.0, abs=1e-3)
     assert right.estimates["actuator_nonlinearity.order"].value == pytest.approx(8.0, abs=0.05)
+
+
+def test_two_time_scales_of_the_flame_behind_a_lag(tmp_path: Path) -> None:
+    """Neither a lag nor a second time scale explains both; from where another form has come, whose
+    response is matched first, the two poles and the zero are found."""
+    effects = [
+        make_effect("flame_dynamics/extra_pole", {"pole_hz": 1750.0}),
+        make_effect("flame_dynamics/second_time_scale", {"slow_share": 0.04, "slow_pole_hz": 47.0}),
+    ]
+    rig = random_rig(10063, noise_db=80.0, modes=(3,))
+    ready = record(tmp_path, 10063, rig, effects, forced=8, validation=2, modes=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    forms = [by_key(f"flame_dynamics:{form}") for form in ("pole", "second_time_scale")]
+    alone = [only(ready, base, form.key) for form in forms]
+    assert not any(t.explains for t in alone)
+    whole = by_key("flame_dynamics:second_time_scale_pole")
+    (found,) = in_each_form(alone[0], ready.data, [whole], InProcess())
+    assert found.explains
+    lag = found.estimates["flame_dynamics.lag_s"]
+    assert abs(lag.value - 1 / (2 * np.pi * 1750.0)) < 4 * lag.stderr
+    assert lag.stderr < 0.1 * lag.value
+    names = {e.key: e for e in CATALOGUE}
+    near = names["flame_dynamics:second_order"]
+    values = {"flame_dynamics.frequency_hz": 900.0, "flame_dynamics.damping": 1.2}
+    for _, _, time in whole.starts_from(near, values):  # as late at low frequencies
+        assert time == pytest.approx(2 * 1.2 / (2 * np.pi * 900.0))
+
+
+def test_a_strong_side_resonator_of_a_tube_with_one_mode(tmp_path: Path) -> None:
+    """It has moved the only mode so far that the load, put on top, would move it as far again: a
+    tenth of it, brought to respond as the further mode did, leads there."""
+    branch = make_effect(
+        "side_resonator", {"frequency_hz": 268.0, "damping": 0.046, "coupling": 0.031}
+    )
+    rig = random_rig(10068, noise_db=60.0, modes=(1,))
+    ready = record(tmp_path, 10068, rig, [branch], forced=8, validation=2, modes=1)
+    base = start.fit_from_data(ready.structure, ready.data)
+    mode = only(ready, base, "acoustic_mode:mode")
+    assert not mode.explains
+    alone = by_key("acoustic_mode:side_resonator_mode")
+    (found,) = in_each_form(mode, ready.data, [alone], InProcess())
+    assert found.explains
+    frequency = found.estimates["acoustic_mode.frequency_hz"]
+    assert abs(frequency.value - 268.0) < 4 * frequency.stderr

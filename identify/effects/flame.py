@@ -1,5 +1,6 @@
 """Flame path: how the heat release may follow the velocity other than declared."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -67,6 +68,38 @@ class SecondTimeScale(Effect):
         return 1.0 - share + share / (s * time + 1.0)
 
 
+class LaggingTimeScales(Effect):
+    """Two parallel time scales behind one more lag, (1 − share + share/(1 + sT)) / (1 + sT').
+
+    Two poles and a zero more than declared: tried where neither explains the data alone.
+    """
+
+    name, location, form, refines = "flame_dynamics", "flame", "second_time_scale_pole", True
+    scales = SecondTimeScale()
+    parameters = (
+        *scales.parameters,
+        Parameter("flame_dynamics.lag_s", "s", 0.0, 0.1, scale=1e-4),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(*row, 0.02 / known.free_hz) for row in self.scales.starts(known)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From the time scales, or with the lag that another has at low frequencies; beside it the
+        other time scale may be a longer one or shorter."""
+        if other.form == "second_time_scale":
+            return [(*(values[q.name] for q in other.parameters), 0.0)]
+        if other.form == "second_order":
+            damping = values["flame_dynamics.damping"]
+            lag = damping / (np.pi * values["flame_dynamics.frequency_hz"])
+        else:
+            lag = values[other.parameters[0].name]
+        return [(0.02, ratio * lag, lag) for ratio in (10.0, 0.3)]
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        return self.scales.flame(p, at, s) / (s * p["flame_dynamics.lag_s"] + 1.0)
+
+
 class FlameResonance(Effect):
     """Second-order response of the flame, ω²/(s² + 2ζωs + ω²)."""
 
@@ -112,6 +145,7 @@ EFFECTS: tuple[Effect, ...] = (
     FlameDelay(),
     ExtraPole(),
     SecondTimeScale(),
+    LaggingTimeScales(),
     FlameResonance(),
     DistributedDelay(),
 )

@@ -163,8 +163,10 @@ class SideResonator(Effect):
         if self.count > 1 and np.all(part[1:] != 0):
             q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
         size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
-        row = (f, zeta, *(size.real * q).tolist(), *q[1:].tolist())
-        return [row] if np.isfinite(row).all() else []
+        # a strong one has moved the modes: from a tenth of the load they are brought there
+        sizes = ((share * size.real * q).tolist() for share in (1.0, 0.1))
+        rows = [(f, zeta, *load, *q[1:].tolist()) for load in sizes]
+        return rows if np.isfinite(rows).all() else []
 
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
         f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]

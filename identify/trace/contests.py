@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
+from identify import assess
 from identify.dataset import Dataset
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
@@ -42,9 +43,11 @@ TOGETHER = ("nonlinearity_shape", "actuator_nonlinearity")  # of which two laws 
 UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
 SETTLED = 16  # of the nearest of them are led on
 RUNNERS_UP = 2  # sets whose other forms are tried for that
-LINEAR = ("flame", "actuator")  # places whose effects are responses that others may be like
+#: Places whose effects are responses that others may be like, and what else is moved for that.
+MOVING = {"flame": "flame.", "actuator": "flame.", "forward": "mode"}
 NEARBY = 0.7  # of the logarithm, where another form is matched
-REFINED = 1500  # iterations of a form that refines another: a long valley may lie between
+REFINED = 1500  # iterations of a form that refines another: a long valley may lie between …
+NEAREST = 2  # … from so many starts at most
 LED_ON = 4  # of the best of a level that had not converged …
 FARTHEST = 300  # … by so many iterations more
 REFORMED = 3  # sets of effects of which other forms are tried: the best one, and others …
@@ -201,15 +204,13 @@ def _in_form(item: _Exchange) -> Fit | None:
     known = [t.fit.values, *_named_otherwise(old, t)]
     taken = [start(row, values) for values in known for row in form.starts_from(old, values)]
     if form.refines:
-        fits = [
-            fit_orbits(larger, data, theta, continuation=(0.003, 0.0), iterations=REFINED)
-            for row in taken
-            if (theta := matched(larger, row, t.fit, data)) is not None
-        ]
-        return min(fits, key=lambda f: f.chi2, default=None)
+        alike = [matched(larger, row, t.fit, data) for row in taken]
+        return _refined(larger, data, [x for x in alike if x is not None])
     rows = [start(row, t.fit.values) for row in form.starts(known_sizes(data, t.fit))]
-    if form.location in LINEAR and form.location == old.location:
-        alike = [matched(larger, row, t.fit, data, moving="flame.") for row in rows]
+    if form.location == old.location and form.location in MOVING:
+        moving = MOVING[form.location]
+        near = taken if moving == "mode" else rows  # of a mode there are starts anywhere
+        alike = [matched(larger, row, t.fit, data, moving) for row in near]
         taken += [theta for theta in alike if theta is not None]
     starts = coarse(larger, data, [*rows, *taken])[:2]
     fits = []
@@ -218,6 +219,19 @@ def _in_form(item: _Exchange) -> Fit | None:
         fits.append(fit_orbits(larger, data, first, continuation=(0.003, 0.0), iterations=30))
     if taken:  # what `t` knows to within the noise, coarse noise would lose
         fits.append(fit_orbits(larger, data, np.stack(taken), continuation=(0.0,), iterations=30))
+    return min(fits, key=lambda f: f.chi2, default=None)
+
+
+def _refined(larger: Structure, data: Dataset, thetas: Sequence[FloatArray]) -> Fit | None:
+    """The fit from the nearest of `thetas`, down long valleys as far as the noise tells."""
+    fits: list[Fit] = []
+    for begun in coarse(larger, data, thetas)[:NEAREST]:
+        fit = fit_orbits(larger, data, begun.theta, continuation=(0.003, 0.0), iterations=FARTHEST)
+        if not fit.converged and assess.lack_of_fit_p(fit.chi2, fit.dof) < ALPHA:
+            fit = fit_orbits(larger, data, fit.theta, continuation=(0.0,), iterations=REFINED)
+        fits.append(fit)
+        if assess.lack_of_fit_p(fit.chi2, fit.dof) > ALPHA:
+            break
     return min(fits, key=lambda f: f.chi2, default=None)
 
 
