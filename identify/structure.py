@@ -382,7 +382,7 @@ class Structure:
             response(resonators, by_flame) * s * on,
             response(resonators, by_drive),
         )
-        seen_flame, seen_drive = at_flame, from_drive
+        seen, seen_flame, seen_drive = resonators, at_flame, from_drive
         if any(m.sensor_ratio is not None for m in modes):
             ratios = [1.0 if m.sensor_ratio is None else m.sensor_ratio for m in modes]
             seen = [b * q for b, q in zip(resonators, ratios, strict=True)]
@@ -407,7 +407,7 @@ class Structure:
         return Loop(
             ((H * at_flame, H * lossy), row),
             (H * (from_drive * drive), q_loss),
-            (seen_flame, lossy),
+            (seen_flame, -response(seen, loss.coefficients)),
             seen_drive * drive,
             (n, loss.characteristic),
             sensor,

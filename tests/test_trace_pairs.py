@@ -9,9 +9,11 @@ import pytest
 from identify import balance, start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
+from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
 from identify.trace.contests import with_fewer
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
+from identify.trace.places import within_a_place
 from tests.trace_material import fitted, search_for, thesis_campaign, tried_as
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
@@ -204,3 +206,58 @@ def test_a_further_mode_must_be_somewhere() -> None:
     """Of a frequency that the data do not know to within its own size nothing has been seen."""
     assert a_further_mode("acoustic_mode.frequency_hz", 0.3).plausible
     assert not a_further_mode("acoustic_mode.frequency_hz", 4.0).plausible
+
+
+def test_two_effects_of_one_place(tmp_path: Path) -> None:
+    """A speaker that lags and bends: each leads the other astray, and a freely shaped speaker does
+    not. From what that makes of the rest, both are found."""
+    effects = {
+        "actuator_dynamics/voice_coil": {"pole_hz": 1500.0},
+        "actuator_nonlinearity/compression": {"cubic_per_v2": 0.0115},
+    }
+    ready = thesis_campaign(tmp_path, 4, effects, noise_db=60.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    quiet = InProcess(), lambda share, text: None
+    pieces = trace.shaped(ready.structure, ready.data, base, [], *quiet)
+    assert [t.effects[0].location for t in pieces if t.adequate] == ["actuator"]
+    keys = ("actuator_dynamics:pole", "actuator_nonlinearity:cubic", "flame_delay")
+    known = [by_key(k) for k in keys]
+    found = within_a_place(ready.structure, ready.data, pieces, known, *quiet)
+    assert {e.name for t in found for e in t.effects} == {k.split(":")[0] for k in keys[:2]}
+    (best,) = {t.key: t for t in found if t.explains}.values()
+    assert len(best.effects) == 2
+    lag = best.estimates["actuator_dynamics.time_s"]
+    assert abs(lag.value - 1 / (2 * np.pi * 1500.0)) < 4 * lag.stderr
+    bent = best.estimates["actuator_nonlinearity.a3"]
+    assert abs(bent.value + 0.0115) < 4 * bent.stderr
+    assert within_a_place(ready.structure, ready.data, pieces[1:], known, *quiet) == []
+
+
+def test_a_late_channel_with_a_lag_of_its_own(tmp_path: Path) -> None:
+    """Two of the same name: a form of both is tried where neither explains the data alone."""
+    effects = {
+        "channel_mismatch/skew": {"skew_s": 2e-5},
+        "channel_mismatch/lowpass": {"lowpass_hz": 4000.0},
+    }
+    ready = thesis_campaign(tmp_path, 4, effects, noise_db=60.0)
+    keys = [f"channel_mismatch:{q}" for q in ("skew", "lowpass", "skew_lowpass", "gain_lowpass")]
+    best, rivals = search_for(ready, *keys)
+    assert best.key_of_forms == ("channel_mismatch:skew_lowpass",)
+    assert rivals == []
+    lag = best.estimates["channel_mismatch.lowpass_time_s"]
+    assert abs(lag.value - 1 / (2 * np.pi * 4000.0)) < 4 * lag.stderr
+
+
+def test_a_loss_is_seen_where_the_velocity_is_taken(tmp_path: Path) -> None:
+    """What a loss makes of each mode stands at the sensor in that mode's own share."""
+    effects = {
+        "sensor_offset": {"offset_m": 0.01},
+        "nonlinear_damping/quadratic": {"quadratic_per_m": 3.0},
+    }
+    ready = thesis_campaign(tmp_path, 4, effects, noise_db=90.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    own = by_key("nonlinear_damping:quadratic_end"), by_key("sensor_offset:modal_2")
+    theta = np.r_[base.theta, own[0].to_internal((3.0, 1.0, 1.0)), own[1].to_internal((0.9,))]
+    steps = (0.1, 0.03, 0.01, 0.003, 0.0)
+    fit = fit_orbits(ready.structure.with_effects(*own), ready.data, theta, continuation=steps)
+    assert fit.chi2_per_dof < 2.0

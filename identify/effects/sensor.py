@@ -4,6 +4,7 @@ The measured pressures themselves say what a mismatch or an offset does: the cor
 from them and added to the prediction, so that it needs no model of the pressure field.
 """
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -60,13 +61,23 @@ class ChannelMismatch(Effect):
             "gain_phase": (gain, phase),
             "lowpass": (lag,),
             "highpass": (corner,),
+            "gain_lowpass": (gain, lag),
+            "skew_lowpass": (skew, lag),
         }[form]
+        self.refines = form in ("gain_lowpass", "skew_lowpass")
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [tuple(p.scale for p in self.parameters)]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.parameters)
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """With what it shares with another form, and the rest at nothing."""
+        if not self.refines:
+            return super().starts_from(other, values)
+        known = {q.name for q in other.parameters}
+        return [tuple(values[q.name] if q.name in known else 0.0 for q in self.parameters)]
 
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
         inverse: Any = 1.0
@@ -202,6 +213,8 @@ EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("gain_phase"),
     ChannelMismatch("lowpass"),
     ChannelMismatch("highpass"),
+    ChannelMismatch("gain_lowpass"),
+    ChannelMismatch("skew_lowpass"),
     SensorOffset("propagation"),
     SensorOffset("mode_shapes"),
     ModalOffset(2),

@@ -27,10 +27,9 @@ from identify.trace.selection import (
     against_chance,
     refitted,
     search,
-    usable,
     without_effects,
 )
-from identify.trace.stages import started_again, try_effects
+from identify.trace.stages import started_again, try_effects, usable
 from identify.trace.tried import (
     ALPHA,
     EVIDENCE,

@@ -17,17 +17,17 @@ from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.results import Whereabouts
 from identify.start import coarse
-from identify.structure import Structure
-from identify.trace.contests import part_of
-from identify.trace.selection import usable
-from identify.trace.stages import known_sizes, shares_of
-from identify.trace.tried import EVIDENCE, Tried, first_of_each, misfit
+from identify.structure import Effect, Structure
+from identify.trace.contests import joins, part_of
+from identify.trace.stages import known_sizes, shares_of, try_effects, usable
+from identify.trace.tried import EVIDENCE, Tried, best_by_name, first_of_each, misfit
 from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave …
 LITTLE = 0.6  # … and any that is not ruled out
 STARTS = 3
+PLACES, PARENTS = 2, 2  # of which two effects are sought together, and from how many first ones
 
 
 def _place(t: Tried) -> str:
@@ -73,6 +73,43 @@ def shaped(
         if fit is not None and fit.chi2 < least:
             found[piece.name] = fit
     return sorted((as_tried(f.structure.effects, f, data) for f in found.values()), key=misfit)
+
+
+def within_a_place(
+    structure: Structure,
+    data: Dataset,
+    pieces: Sequence[Tried],
+    available: Sequence[Effect],
+    executor: Executor,
+    progress: Callable[[float, str], None],
+) -> list[Tried]:
+    """One effect or two of the same place, where its freely shaped piece explains the data.
+
+    From what the piece makes of the declared model: two that both distort what the declared fit
+    makes of the rest lead each other astray, and neither leads to the other alone.
+    """
+    out: list[Tried] = []
+    for piece in [t for t in pieces if t.adequate][:PLACES]:
+        own = [e for e in available if e.location == _place(piece)]
+        start = part_of(piece, (), data).theta
+        base = fit_orbits(structure, data, start, continuation=(0.0,), iterations=0)
+        if not own or not np.isfinite(base.chi2):
+            continue
+
+        def grown(base: Fit, effects: Sequence[Effect], keep: int) -> list[Tried]:
+            return try_effects(
+                base.structure, data, base, effects,
+                executor=executor, keep=keep, far=False, progress=progress, scores={},
+            )  # fmt: skip
+
+        first = grown(base, own, len(own))
+        out += first
+        for parent in best_by_name(first)[:PARENTS]:
+            rest = [e for e in own if joins(e, parent.effects)]
+            out += grown(parent.fit, rest, len(rest)) if rest else []
+        if any(t.explains for t in out):
+            break
+    return out
 
 
 def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> Whereabouts:

@@ -30,8 +30,9 @@ from identify.trace.contests import (
     with_fewer,
 )
 from identify.trace.pairs import pairs_from_afar
+from identify.trace.places import shaped, within_a_place
 from identify.trace.scores import ScoreTest, score_tests
-from identify.trace.stages import as_declared, started_again, try_effects
+from identify.trace.stages import as_declared, started_again, try_effects, usable
 from identify.trace.tried import (
     BEATEN,
     EVIDENCE,
@@ -68,6 +69,7 @@ class Search:
 
     tried: tuple[Tried, ...]
     singles: tuple[Tried, ...]
+    pieces: tuple[Tried, ...] = ()  # freely shaped, where they were asked, best first
 
 
 def search(
@@ -96,7 +98,7 @@ def search(
         tuple(e for e in catalogue if isinstance(e, Scatter)),
     )
     singles = going.alone(scores)
-    level = best_by_name(singles)
+    level, pieces = best_by_name(singles), list[Tried]()
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
@@ -116,11 +118,12 @@ def search(
         level = best_by_name(found)
         if size == 2 and not going.explained:
             level = [*going.of_more_modes(level), *level]
+        if size == 2 and not going.explained:
+            pieces = going.in_one_place()
     going.contest()
     everything = against_chance(going.tried)
-    return Search(
-        tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2))), tuple(singles)
-    )
+    ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
+    return Search(ranked, tuple(singles), tuple(pieces))
 
 
 @dataclass
@@ -152,6 +155,11 @@ class _Searching:
     @property
     def explained(self) -> bool:
         return any(t.explains for t in self.tried)
+
+    @property
+    def by_chance(self) -> bool:
+        """Whether a spread explains the data by itself: what else is in them is within it."""
+        return any(t.explains and t.spread and len(t.effects) == 1 for t in self.tried)
 
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
@@ -236,19 +244,20 @@ class _Searching:
     def _led_to_the_end(self, grown: Sequence[Tried]) -> list[Tried]:
         """With what had not converged led on, and, if still nothing explains, in other forms."""
         out = [*grown, *led_on(grown, self.data, self.run)]
-        if not any(t.explains for t in out):
+        if not (self.by_chance or any(t.explains for t in out)):
             self.report(0.6, "trying other forms of the best")
             others = reformed(out, self.data, self.forms, self.run, self.done)
             out += [*others, *led_on(others, self.data, self.run)]
         return out
 
     def with_chance(self, parents: Sequence[Tried]) -> None:
-        """Run-to-run scatter beside each of `parents`, and effects beside scatter."""
+        """Run-to-run scatter beside each of `parents`, and effects beside scatter: where that
+        explains the data alone, those that promise most within it."""
         data, run = self.data, self.run
         self.report(0.6, "trying run-to-run scatter beside an effect")
         good = [t for t in self.tried if t.explains]
         by_law = [t for t in good if t.spread is None]
-        for parent in parents:
+        for parent in [] if self.by_chance else parents:
             if by_law and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
             found = self._scattered(parent.fit.structure, parent.fit)
@@ -300,6 +309,18 @@ class _Searching:
         good = [t.evidence for t in self.tried if t.explains]
         most = min(good, default=np.inf) + EVIDENCE
         return try_scatters(structure, self.data, base, self.scatters, self.run, most)
+
+    def in_one_place(self) -> list[Tried]:
+        """Two effects of the place whose freely shaped piece explains the data; the pieces."""
+
+        def report(share: float, text: str) -> None:
+            self.report(0.93 + 0.02 * share, text)
+
+        data, run = self.data, self.run
+        pieces = shaped(self.structure, data, self.base, self.tried, run, report)
+        found = within_a_place(self.structure, data, pieces, self.apart, run, report)
+        self.tried += [eliminate(t, data) if t.explains else t for t in found]
+        return pieces
 
     def contest(self) -> None:
         """What might do as well as the best is tried before it is claimed, and, where nothing can
@@ -583,13 +604,3 @@ def _fuller(catalogue: Sequence[Effect], data: Dataset, structure: Structure) ->
         found = (e for e in catalogue if e.mode_count is not None and usable(e, data, more))
         out += [e for e in found if e.key not in known and not e.refines]
     return tuple(out)
-
-
-def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
-    """Whether the effect can be added to this declared model and asked of these data."""
-    if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
-        return False
-    if effect.mode_count not in (None, structure.mode_count):
-        return False
-    pressure = any(np.any(b.at.pressure != 0) for b in data.fit)
-    return not ("pressure" in effect.needs and not pressure)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from identify import assess
 from identify.dataset import Dataset
+from identify.effects.scatter import Scatter
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import (
@@ -468,3 +469,13 @@ def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float,
         if ratio not in out:
             out.append(ratio)
     return tuple(out[:2])
+
+
+def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
+    """Whether the effect can be added to this declared model and asked of these data."""
+    if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
+        return False
+    if effect.mode_count not in (None, structure.mode_count):
+        return False
+    pressure = any(np.any(b.at.pressure != 0) for b in data.fit)
+    return not ("pressure" in effect.needs and not pressure)
