@@ -18,9 +18,10 @@ import numpy as np
 from trace_study import to_campaign
 
 from identify import start, trace
-from identify.effects import by_key
+from identify.effects import CATALOGUE
 from identify.fit import Fit, fit_orbits
 from identify.identification import Prepared, prepare
+from identify.structure import Effect
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign
 from simulated_rig.effects import EFFECTS
@@ -59,6 +60,12 @@ FORMS = {
 }
 
 
+def form_of(key: str, modes: int) -> Effect:
+    """The effect as fitted, in the form for so many modes where it has a share of each."""
+    name = FORMS[key].replace("modal_2", f"modal_{modes}")
+    return next(e for e in CATALOGUE if e.key == name and e.mode_count in (None, modes))
+
+
 def recorded(keys: Sequence[str], share: float) -> Prepared:
     """A campaign with these effects, each of that share of its range from visible to gross."""
     made = [EFFECTS[k].draw(np.random.default_rng(SEED), share) for k in keys]
@@ -76,7 +83,7 @@ def alone(item: tuple[str, float]) -> tuple[str, Fit | None]:
         print(f"{key}: {error}", file=sys.stderr)
         return key, None
     base = start.fit_from_data(ready.structure, ready.data)
-    found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(FORMS[key])], depth=1)
+    found = trace.search(ready.structure, ready.data, base, catalogue=[form_of(key, 2)], depth=1)
     best = min(found.singles, key=lambda t: t.fit.chi2, default=None)
     return key, None if best is None else best.fit
 
@@ -88,10 +95,13 @@ def together(item: tuple[tuple[str, str], tuple[Fit, Fit], float]) -> tuple[tupl
         ready = recorded(pair, share)
     except ValueError as error:
         return pair, str(error)
-    effects = [by_key(FORMS[k]) for k in pair]
+    modes = 3 if "acoustic_mode" in pair else 2
+    effects = [form_of(k, modes) for k in pair]
     structure = ready.structure.with_effects(*effects)
     count = len(ready.structure.parameters)
-    starts = [np.r_[f.theta[:count], fits[0].theta[count:], fits[1].theta[count:]] for f in fits]
+    known = {n: x for f in fits for n, x in f.values.items()}  # of a further mode: as of the first
+    own = [e.to_internal([known.get(q.name, 1.0) for q in e.parameters]) for e in effects]
+    starts = [np.r_[f.theta[:count], *own] for f in fits]
     found = [
         fit_orbits(structure, ready.data, theta, continuation=steps, iterations=200)
         for theta in starts
@@ -119,7 +129,7 @@ def main() -> int:
         pairs = [
             (a, b)
             for a, b in combinations(fits, 2)
-            if by_key(FORMS[a]).name != by_key(FORMS[b]).name
+            if form_of(a, 2).name != form_of(b, 2).name
             and (a.startswith(given.only) or b.startswith(given.only))
         ]
         items = [(p, (fits[p[0]], fits[p[1]]), given.share) for p in pairs]

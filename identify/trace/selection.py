@@ -51,7 +51,8 @@ from identify.trace.tried import (
 Progress = Callable[[float, str], None]
 
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
-SOFTENED = (0.005, 0.02)  # shares of each coefficient that count as noise, to see what is greatest
+#: Shares of each coefficient that count as noise, to see what is greatest: chance, or a law.
+CHANCE_SOFTENED, LAW_SOFTENED = (0.001, 0.005, 0.02), (0.005, 0.02)
 FOREMOST = 2  # laws seen there beside which chance is tried
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought, and chance, from afar
@@ -266,34 +267,42 @@ class _Searching:
         if not by_law:
             alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
             self._add_beside_chance(_beside_chance(alone, data, self.apart, run))
-        for share in SOFTENED:
-            if not self.explained and _least(self.tried) > MUCH:
-                self._from_softened(share)
+        for shares, seek in (
+            (CHANCE_SOFTENED, self._chance_from_softened),
+            (LAW_SOFTENED, self._law_from_softened),
+        ):
+            for share in shares:
+                if not self.explained and _least(self.tried) > MUCH:
+                    self.report(0.6, f"looking at the data to within {share:.1%}")
+                    soft = replace(data, fit=soften(data.fit, share))
+                    base = fit_from_data(self.structure, soft)
+                    if np.isfinite(base.chi2):
+                        seek(soft, base)
         if not self.explained:
             found = _other_forms_beside_chance(self.tried, data, self.apart, run)
             self._add_beside_chance(found)
         if not self.explained:
             self.tried += _in_the_place_of_chance(self.tried, data, self.apart, run)
 
-    def _from_softened(self, share: float) -> None:
-        """An effect and chance that are both gross lead each other astray. Where noise of such a
-        `share` of every coefficient hides the lesser of them, the greater is found by itself."""
-        self.report(0.6, f"looking at the data to within {share:.1%}")
-        data, run = self.data, self.run
-        soft = replace(data, fit=soften(data.fit, share))
-        base = fit_from_data(self.structure, soft)
-        if not np.isfinite(base.chi2):
-            return
+    def _chance_from_softened(self, soft: Dataset, base: Fit) -> None:
+        """An effect and chance that are both gross lead each other astray. Where noise of some
+        share of every coefficient hides the lesser of them, the greater is found by itself: chance,
+        and a law within it; or (`_law_from_softened`) a law, and chance beside it."""
+        spreads = try_scatters(self.structure, soft, base, self.scatters, self.run)
+        found = _beside_chance(spreads, self.data, self.apart, self.run)
+        found += _simpler_beside_chance(found, self.data, self.apart, self.run)
+        self._add_beside_chance(found)
+
+    def _law_from_softened(self, soft: Dataset, base: Fit) -> None:
+        """The same where the law is the greater."""
         laws = try_effects(
-            self.structure, soft, base, self.apart, executor=run, keep=5,
+            self.structure, soft, base, self.apart, executor=self.run, keep=5,
             far=astray(base), progress=lambda done, text: None,
         )  # fmt: skip
         found = []
         for t in best_by_name(laws)[:FOREMOST]:
             found += self._scattered(t.fit.structure, t.fit)
-        spreads = try_scatters(self.structure, soft, base, self.scatters, run)
-        found += _beside_chance(spreads, data, self.apart, run)
-        found += _simpler_beside_chance(found, data, self.apart, run)
+        found += _simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
 
     def _add_beside_chance(self, found: Sequence[Tried]) -> None:
