@@ -804,3 +804,17 @@ def test_between_spreads_the_likelihood_decides(
     )
     assert not lacking.explains
     assert (trace.rivals(best, [best, lacking]) == [lacking]) is rival
+
+
+def test_a_law_beside_a_spread_leaves_what_noise_usually_does() -> None:
+    """It is the best of many, beside what takes up much: that it is hardly noise speaks against it.
+    A spread alone, or a law alone, may leave so little."""
+    size = Estimate(1e-3, 1e-4, "1")
+    chance = trace.Tried((DRIVE,), fitted(11, 1.0), 1e-3, 0.05, 0.5)
+    spread = Spread(chance.fit, None, {DRIVE.parameters[0].name: size}, 10.0, "")  # type: ignore[arg-type]
+    alone = replace(chance, spread=spread)
+    beside = replace(alone, effects=(by_key("flame_delay"), DRIVE))
+    assert alone.leaves_noise
+    assert not beside.leaves_noise
+    assert replace(beside, fit_p=0.2).leaves_noise
+    assert replace(beside, effects=(by_key("flame_delay"),), spread=None).leaves_noise

@@ -28,7 +28,8 @@ ALPHA = 1e-3  # false-alarm probability of each significance test
 GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
 OVERDAMPED = 0.15  # damping ratio of a mode that has strayed, where a misfit is left …
 VISIBLE = 10.0  # … of so much χ²/dof
-LEFT_P = 0.03  # chance below which what a spread leaves is more than noise
+LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
+LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws leaves less by chance
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
@@ -89,7 +90,13 @@ class Tried:
     def explains(self) -> bool:
         """Adequate, and with values that can be true. A spread must leave nothing but noise: it
         takes away so much of any law's misfit that little is left to betray one."""
-        return self.adequate and self.plausible and (self.spread is None or self.fit_p > LEFT_P)
+        return self.adequate and self.plausible and self.leaves_noise
+
+    @property
+    def leaves_noise(self) -> bool:
+        """Whether what is left beside a spread, if there is one, is as probable as it must be."""
+        least = LEFT_P if len(self.effects) == 1 else LEFT_BESIDE_P
+        return self.spread is None or self.fit_p > least
 
     @property
     def deviance(self) -> float:
@@ -345,5 +352,5 @@ def _note(t: Tried) -> str:
         return t.fit.reason
     if t.spread is None:
         return ""
-    left = "leaves more than noise" if t.adequate and not t.fit_p > LEFT_P else ""
+    left = "leaves more than noise" if t.adequate and not t.leaves_noise else ""
     return t.spread.objection or left
