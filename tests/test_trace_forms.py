@@ -157,7 +157,7 @@ def test_two_further_modes_beside_another_effect(tmp_path: Path) -> None:
     """No pair of other effects comes near; from the modes alone the other is found."""
     gain = {"channel_mismatch/gain": {"gain": 0.01}}
     ready = thesis_campaign(tmp_path, 7, gain, noise_db=45.0, preset="thesis-four-mode")
-    keys = ("acoustic_mode:mode", "acoustic_mode:two_modes", "channel_mismatch:gain", "flame_delay")
+    keys = ("acoustic_mode:mode", "acoustic_mode:two_modes", "channel_mismatch:gain")
     best, rivals = search_for(ready, *keys)
     assert [e.key for e in best.effects] == ["acoustic_mode:two_modes", "channel_mismatch:gain"]
     assert rivals == []

@@ -118,9 +118,10 @@ def search(
                 found += going.pairs(singles)
         level = best_by_name(found)
         if size == 2 and not going.explained:
-            level = [*going.of_more_modes(level), *level]
-        if size == 2 and not going.explained:
-            pieces = going.in_one_place()
+            several = going.of_more_modes(level)
+            level = [*several, *level]
+            if not several:  # which come nearer than any two
+                pieces = going.in_one_place()
     going.contest()
     everything = against_chance(going.tried)
     ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
