@@ -402,12 +402,13 @@ class Structure:
             )
         lossy = -response(resonators, loss.coefficients)
         felt = [b * w for b, w in zip(resonators, loss.weights, strict=True)]
+        seen_lossy = lossy if seen is resonators else -response(seen, loss.coefficients)
         row = (response(felt, by_flame) * s * on, -response(felt, loss.coefficients))
         q_loss = response(felt, by_drive) * drive
         return Loop(
             ((H * at_flame, H * lossy), row),
             (H * (from_drive * drive), q_loss),
-            (seen_flame, -response(seen, loss.coefficients)),
+            (seen_flame, seen_lossy),
             seen_drive * drive,
             (n, loss.characteristic),
             sensor,

@@ -209,8 +209,7 @@ def test_two_time_scales_of_the_flame_behind_a_lag(tmp_path: Path) -> None:
     lag = found.estimates["flame_dynamics.lag_s"]
     assert abs(lag.value - 1 / (2 * np.pi * 1750.0)) < 4 * lag.stderr
     assert lag.stderr < 0.1 * lag.value
-    names = {e.key: e for e in CATALOGUE}
-    near = names["flame_dynamics:second_order"]
+    near = by_key("flame_dynamics:second_order")
     values = {"flame_dynamics.frequency_hz": 900.0, "flame_dynamics.damping": 1.2}
     for _, _, time in whole.starts_from(near, values):  # as late at low frequencies
         assert time == pytest.approx(2 * 1.2 / (2 * np.pi * 900.0))

@@ -88,6 +88,13 @@ def within_a_place(
     From what the piece makes of the declared model: two that both distort what the declared fit
     makes of the rest lead each other astray, and neither leads to the other alone.
     """
+
+    def grown(base: Fit, effects: Sequence[Effect]) -> list[Tried]:
+        return try_effects(
+            base.structure, data, base, effects,
+            executor=executor, keep=len(effects), far=False, progress=progress, scores={},
+        )  # fmt: skip
+
     out: list[Tried] = []
     for piece in [t for t in pieces if t.adequate][:PLACES]:
         own = [e for e in available if e.location == _place(piece)]
@@ -95,18 +102,11 @@ def within_a_place(
         base = fit_orbits(structure, data, start, continuation=(0.0,), iterations=0)
         if not own or not np.isfinite(base.chi2):
             continue
-
-        def grown(base: Fit, effects: Sequence[Effect], keep: int) -> list[Tried]:
-            return try_effects(
-                base.structure, data, base, effects,
-                executor=executor, keep=keep, far=False, progress=progress, scores={},
-            )  # fmt: skip
-
-        first = grown(base, own, len(own))
+        first = grown(base, own)
         out += first
         for parent in best_by_name(first)[:PARENTS]:
             rest = [e for e in own if joins(e, parent.effects)]
-            out += grown(parent.fit, rest, len(rest)) if rest else []
+            out += grown(parent.fit, rest) if rest else []
         if any(t.explains for t in out):
             break
     return out

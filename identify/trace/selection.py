@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 import numpy as np
 
@@ -161,7 +162,11 @@ class _Searching:
     @property
     def by_chance(self) -> bool:
         """Whether a spread explains the data by itself: what else is in them is within it."""
-        return any(t.explains and t.spread and len(t.effects) == 1 for t in self.tried)
+        return any(t.explains for t in self.spreads_alone)
+
+    @property
+    def spreads_alone(self) -> list[Tried]:
+        return [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
 
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
@@ -266,8 +271,13 @@ class _Searching:
             found += _simpler_beside_chance(found, data, self.apart, run)
             self._add_beside_chance(found)
         if not by_law:
-            alone = [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
-            self._add_beside_chance(_beside_chance(alone, data, self.apart, run))
+            self._add_beside_chance(_beside_chance(self.spreads_alone, data, self.apart, run))
+
+        @cache
+        def softened(share: float) -> tuple[Dataset, Fit]:
+            soft = replace(data, fit=soften(data.fit, share))
+            return soft, fit_from_data(self.structure, soft)
+
         for shares, seek in (
             (CHANCE_SOFTENED, self._chance_from_softened),
             (LAW_SOFTENED, self._law_from_softened),
@@ -275,8 +285,7 @@ class _Searching:
             for share in shares:
                 if not self.explained and _least(self.tried) > MUCH:
                     self.report(0.6, f"looking at the data to within {share:.1%}")
-                    soft = replace(data, fit=soften(data.fit, share))
-                    base = fit_from_data(self.structure, soft)
+                    soft, base = softened(share)
                     if np.isfinite(base.chi2):
                         seek(soft, base)
         if not self.explained:
