@@ -114,7 +114,7 @@ def diagnose(
     @cache
     def pieces() -> list[Tried]:
         seen, begun, shapes = searched
-        if shapes and seen is data and begun is base:
+        if seen is data and ((begun is base and shapes) or any(t.adequate for t in shapes)):
             return list(shapes)
         return trace.shaped(
             ready.structure, data, base, tried, run,
@@ -122,8 +122,8 @@ def diagnose(
         )  # fmt: skip
 
     verdict, chosen, explanation = _judge(declared, tried, data)
-    if chosen is not None and (chosen.spread is not None or chosen.fit_p < DOUBTFUL):
-        # a spread takes up much, and so may a law: not where one does better that nobody knows
+    if chosen is not None and (chosen.fit_p < DOUBTFUL or chosen.spread or len(chosen.effects) > 1):
+        # a spread takes up much, and so may laws: not where one does better that nobody knows
         tried = trace.against_chance(tried, pieces())
         verdict, chosen, explanation = _judge(declared, tried, data, pieces())
     if tones and verdict in ("no_discrepancy", "traced"):

@@ -508,7 +508,9 @@ def test_a_claim_takes_most_of_the_misfit_away(
         ("flame_delay", {"delay_s": 3e-4}, "flame"),
         ("nonlinearity_shape/quartic", {}, "nonlinearity"),
         ("actuator_dynamics/voice_coil", {}, "actuator"),
+        ("actuator_nonlinearity/clipping", {}, "actuator"),
         ("channel_mismatch/gain", {}, "sensor"),
+        ("sensor_offset", {"offset_m": 0.056}, "sensor"),
         ("parameter_drift/damping", {}, "experiment"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Freely shaped pieces, one for each place of the loop: they stand for no law, only for the place.
+"""Freely shaped pieces for each place of the loop: they stand for no law, only for the place.
 
 A linear response is 1 + Σ_j h_j (B^j − 1), B = (ω₀ − s)/(ω₀ + s), j = 1 … 4: powers of an all-pass
 step at the free frequency follow any smooth response and grow nowhere (Laguerre's functions).
@@ -24,6 +24,7 @@ STEPS = 4
 MODE = AcousticMode()
 LOSS = NonlinearDamping("cubic")
 DISTORTION = Distortion((2, 3))
+CUT_OFF = Distortion((2, 3, 5, 7))  # at both ends
 POWERS = HigherOrder((4, 5, 6, 7))
 WANDERING = ("frequency", "damping", "flame", "speaker")
 
@@ -34,12 +35,16 @@ class Shaped(Effect):
     linear = True
     besides: tuple[Parameter, ...] = ()
 
-    def __init__(self, free_hz: float) -> None:
+    def __init__(self, free_hz: float, modes: int) -> None:
         self.corner = 2 * np.pi * free_hz
         self.name = f"shaped_{self.location}"
         steps = range(1, STEPS + 1) if self.linear else ()
         own = tuple(Parameter(f"{self.name}.h{j}", "1", scale=1e-2) for j in steps)
-        self.parameters = (*own, *self.besides)
+        self.parameters = (*own, *self.besides, *self.of_modes(modes))
+
+    def of_modes(self, modes: int) -> tuple[Parameter, ...]:
+        """What it needs of each of so many declared modes."""
+        return ()
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.0,) * len(self.parameters)]
@@ -80,6 +85,15 @@ class ShapedActuator(Shaped):
         return DISTORTION.drive(p, at, u)
 
 
+class CutActuator(ShapedActuator):
+    """The same with a distortion as strong as where an amplifier clips."""
+
+    form, besides = "cut_off", CUT_OFF.parameters
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        return CUT_OFF.drive(p, at, u)
+
+
 class ShapedSensor(Shaped):
     """Any smooth linear response of the velocity's measurement, and a share of the pressure."""
 
@@ -92,6 +106,21 @@ class ShapedSensor(Shaped):
         shares: Sequence[Any] = [p[q.name] for q in self.besides]
         passed = shares[0] + step * shares[1] + step * step * shares[2]
         return with_leak(at, y * self.response(p, s), leak * passed)
+
+
+class ModalSensor(ShapedSensor):
+    """The same with each mode as large there as it likes."""
+
+    form = "modal"
+
+    def of_modes(self, modes: int) -> tuple[Parameter, ...]:
+        names = (f"shaped_sensor.ratio{i}" for i in range(2, modes + 1))
+        return tuple(Parameter(name, "1", scale=1e-2) for name in names)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        first, *others = modes
+        shares = (p[f"shaped_sensor.ratio{i}"] + 1.0 for i in range(2, len(modes) + 1))
+        return [first, *(replace(m, sensor_ratio=q) for m, q in zip(others, shares, strict=True))]
 
 
 class ShapedForward(Shaped):
@@ -161,6 +190,8 @@ PIECES: tuple[type[Shaped], ...] = (
     ShapedFlame,
     ShapedNonlinearity,
     ShapedActuator,
+    CutActuator,
     ShapedSensor,
+    ModalSensor,
     ShapedExperiment,
 )

@@ -6,13 +6,14 @@ claimed, what might do as well from where it ended is tried.
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import least_squares
 
-from identify import assess
+from identify import assess, dual
 from identify.dataset import Dataset
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
@@ -205,7 +206,7 @@ def _in_form(item: _Exchange) -> Fit | None:
     taken = [start(row, values) for values in known for row in form.starts_from(old, values)]
     if form.refines:
         alike = [matched(larger, row, t.fit, data) for row in taken]
-        return _refined(larger, data, [x for x in alike if x is not None])
+        return _refined(larger, data, [x for x in alike if x is not None], t.fit.chi2)
     rows = [start(row, t.fit.values) for row in form.starts(known_sizes(data, t.fit))]
     if form.location == old.location and form.location in MOVING:
         moving = MOVING[form.location]
@@ -222,12 +223,16 @@ def _in_form(item: _Exchange) -> Fit | None:
     return min(fits, key=lambda f: f.chi2, default=None)
 
 
-def _refined(larger: Structure, data: Dataset, thetas: Sequence[FloatArray]) -> Fit | None:
-    """The fit from the nearest of `thetas`, down long valleys as far as the noise tells."""
+def _refined(
+    larger: Structure, data: Dataset, thetas: Sequence[FloatArray], coarser: float
+) -> Fit | None:
+    """The fit from the nearest of `thetas`, down long valleys as far as the noise tells, where that
+    comes below the χ² of the form that it refines, `coarser`."""
     fits: list[Fit] = []
     for begun in coarse(larger, data, thetas)[:NEAREST]:
         fit = fit_orbits(larger, data, begun.theta, continuation=(0.003, 0.0), iterations=FARTHEST)
-        if not fit.converged and assess.lack_of_fit_p(fit.chi2, fit.dof) < ALPHA:
+        misfits = assess.lack_of_fit_p(fit.chi2, fit.dof) < ALPHA
+        if misfits and fit.chi2 < coarser and not fit.converged:
             fit = fit_orbits(larger, data, fit.theta, continuation=(0.0,), iterations=REFINED)
         fits.append(fit)
         if assess.lack_of_fit_p(fit.chi2, fit.dof) > ALPHA:
@@ -245,25 +250,31 @@ def matched(
     own = {q.name for q in larger.effects[-1].parameters}
     free = [i for i, n in enumerate(names) if n.startswith(moving) or n in own]
 
-    def responses(structure: Structure, values: Mapping[str, float]) -> ComplexArray:
-        parts = []
+    def responses(structure: Structure, at: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """At all harmonics (n,), and their derivatives by the unknowns (n, p)."""
+        parts, slopes = [], []
         for b in data.fit:
-            at = replace(b.at, drive=np.ones_like(b.at.drive))
-            s = 1j * at.omega[:, None] * np.arange(1, at.drive.shape[1] + 1)
-            loop = structure.assemble(values, at, s)
-            parts += [np.broadcast_to(x, s.shape).ravel() for x in (loop.G[0], loop.G_u, loop.H)]
-        return np.concatenate(parts)
+            given = replace(b.at, drive=np.ones_like(b.at.drive))
+            s = 1j * given.omega[:, None] * np.arange(1, given.harmonics + 1)
+            loop = structure.assemble(structure.parameters.seeded(at[None], b.runs), given, s)
+            for x in (loop.G[0], loop.G_u, loop.H):
+                parts.append(np.broadcast_to(dual.value(x), s.shape).ravel())
+                slopes.append(dual.derivative(x, s.shape, at.size).reshape(s.size, at.size))
+        return np.concatenate(parts), np.concatenate(slopes)
 
-    target = responses(fit.structure, fit.values)
+    target, _ = responses(fit.structure, fit.theta)
     scale = np.where(target == 0, 1.0, target)  # of the flame in cold runs
 
-    def difference(x: FloatArray) -> FloatArray:
+    @lru_cache(maxsize=1)
+    def compared(x: tuple[float, ...]) -> tuple[FloatArray, FloatArray]:
         moved = theta.copy()
         moved[free] = x
         with np.errstate(all="ignore"):
-            rest = (responses(larger, larger.parameters.plain(moved)) - target) / scale
-        both = np.concatenate([rest.real, rest.imag])
-        return np.asarray(np.nan_to_num(both, nan=1e6, posinf=1e6, neginf=-1e6))
+            there, slopes = responses(larger, moved)
+            rest, slopes = (there - target) / scale, slopes[:, free] / scale[:, None]
+        both = (np.concatenate([c.real, c.imag]) for c in (rest, slopes))
+        rest, slopes = (np.nan_to_num(c, nan=1e6, posinf=1e6, neginf=-1e6) for c in both)
+        return rest, slopes
 
     low, high = (np.asarray(limit)[free] for limit in larger.parameters.bounds())
     begin = np.clip(theta[free], low + 1e-9, high - 1e-9)
@@ -272,7 +283,16 @@ def matched(
     )
     low = np.where(near, np.maximum(low, begin - NEARBY), low)
     high = np.where(near, np.minimum(high, begin + NEARBY), high)
-    found = least_squares(difference, begin, bounds=(low, high), x_scale="jac", max_nfev=150)
+
+    def difference(x: FloatArray) -> FloatArray:
+        return compared(tuple(x))[0]
+
+    def jacobian(x: FloatArray) -> FloatArray:
+        return compared(tuple(x))[1]
+
+    found = least_squares(
+        difference, begin, jacobian, bounds=(low, high), x_scale="jac", max_nfev=150
+    )
     if not np.sqrt(np.mean(found.fun**2)) < 0.1:
         return None
     out = theta.copy()

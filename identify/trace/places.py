@@ -16,7 +16,7 @@ from identify.effects.shaped import PIECES
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.results import Whereabouts
-from identify.start import coarse
+from identify.start import CoarseStart, coarse, polish
 from identify.structure import Effect, Structure
 from identify.trace.contests import joins, part_of
 from identify.trace.stages import known_sizes, shares_of, try_effects, usable
@@ -59,20 +59,18 @@ def shaped(
     executor: Executor,
     progress: Callable[[float, str], None],
 ) -> list[Tried]:
-    """A piece at each place, started from the declared fit and from what the best of `tried` make
-    of the declared model; best first."""
-    pieces = [p for p in (piece(data.free_hz) for piece in PIECES) if usable(p, data, structure)]
+    """The pieces of each place, started from the declared fit and from what the best of `tried`
+    make of the declared model; best first."""
+    every = [piece(data.free_hz, structure.mode_count) for piece in PIECES]
+    pieces = [p for p in every if usable(p, data, structure)]
     best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]
     bases = [base, *(part_of(t, (), data) for t in best)]
-    items = [(structure.with_effects(p), data, b) for p in pieces for b in bases]
-    found: dict[str, Fit] = {}
-    for i, fit in enumerate(executor.map(_shape, items)):
-        piece = items[i][0].effects[0]
-        progress((i + 1) / len(items), f"shaping the {piece.location} freely")
-        least = found[piece.name].chi2 if piece.name in found else np.inf
-        if fit is not None and fit.chi2 < least:
-            found[piece.name] = fit
-    return sorted((as_tried(f.structure.effects, f, data) for f in found.values()), key=misfit)
+    found = []
+    for i, fit in enumerate(executor.map(_shape, [(structure, data, p, bases) for p in pieces])):
+        progress((i + 1) / len(pieces), f"shaping the {pieces[i].location} freely")
+        if fit is not None and np.isfinite(fit.chi2):
+            found.append(as_tried(fit.structure.effects, fit, data))
+    return sorted(found, key=misfit)
 
 
 def within_a_place(
@@ -96,7 +94,8 @@ def within_a_place(
         )  # fmt: skip
 
     out: list[Tried] = []
-    for piece in [t for t in pieces if t.adequate][:PLACES]:
+    adequate = first_of_each([t for t in pieces if t.adequate], _place)
+    for piece in list(adequate.values())[:PLACES]:
         own = [e for e in available if e.location == _place(piece)]
         start = part_of(piece, (), data).theta
         base = fit_orbits(structure, data, start, continuation=(0.0,), iterations=0)
@@ -122,14 +121,18 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
     return Whereabouts(likely, left, base.chi2_per_dof)
 
 
-def _shape(item: tuple[Structure, Dataset, Fit]) -> Fit | None:
-    """The fit of a structure with one piece, from a fit without it, if any starts."""
-    structure, data, base = item
-    piece = structure.effects[0]
-    inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
-    first, *others = shares_of(base, data)
-    starts = coarse(structure, data, [np.r_[base.theta, row] for row in inner], first)[:STARTS]
-    if not starts:
+def _shape(item: tuple[Structure, Dataset, Effect, Sequence[Fit]]) -> Fit | None:
+    """The fit of a structure with one piece, from the fits without it that are nearest once the
+    noise is as large as the misfit of the worst, if any starts."""
+    plain, data, piece, bases = item
+    structure, starts = plain.with_effects(piece), list[CoarseStart]()
+    for base in bases:
+        inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
+        share, *_ = shares_of(base, data)
+        starts += coarse(structure, data, [np.r_[base.theta, row] for row in inner], share)[:STARTS]
+    first, second, last = max(shares_of(base, data) for base in bases)
+    led = polish(structure, data, starts, (first, second), 8)[:STARTS]
+    if not led:
         return None
-    thetas = np.stack([s.theta for s in starts])
-    return fit_orbits(structure, data, thetas, continuation=(first, *others, 0.0))
+    thetas = np.stack([s.theta for s in led])
+    return fit_orbits(structure, data, thetas, continuation=(last, 0.0))

@@ -100,29 +100,31 @@ def search(
         tuple(e for e in catalogue if isinstance(e, Scatter)),
     )
     singles = going.alone(scores)
-    level, pieces = best_by_name(singles), list[Tried]()
+    level = best_by_name(singles)
+    pieces = [] if going.explained or depth < 2 else going.in_one_place()
+    in_one_place = any(t.adequate for t in pieces)
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
+        if in_one_place and size > 2:  # three would stand for one that nobody has named
+            break
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
-        nowhere = size == 2 and not _a_place_to_grow_from(singles, base)
+        nowhere = size == 2 and not (in_one_place or _a_place_to_grow_from(singles, base))
         found = going.pairs(singles) if nowhere else []
         if not going.explained or not nowhere:
-            found += going.grown(parents)
+            found = going.grown(parents, found)
         if size == 2:
             going.with_chance(parents)
-            if not nowhere and base.chi2_per_dof > GROSS and _least(found) > MUCH:
+            far = base.chi2_per_dof > GROSS and _least(found) > MUCH
+            if far and not (nowhere or in_one_place):
                 found += going.pairs(singles)
         level = best_by_name(found)
         if size == 2 and not going.explained:
-            several = going.of_more_modes(level)
-            level = [*several, *level]
-            if not several:  # which come nearer than any two
-                pieces = going.in_one_place()
+            level = [*going.of_more_modes(level), *level]
     going.contest()
     everything = against_chance(going.tried)
     ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
@@ -204,12 +206,14 @@ class _Searching:
             self.structure, self.data, self.base, self.apart, singles, self.run,
             lambda share, text: self.report(0.6 + 0.3 * share, text),
         )  # fmt: skip
-        pairs = self._led_to_the_end(pairs)
+        pairs += led_on(pairs, self.data, self.run)
+        if _least(pairs) <= GROSS:
+            pairs += self._in_other_forms(pairs)
         self.tried += [eliminate(t, self.data) if t.explains else t for t in pairs]
         return pairs
 
-    def grown(self, parents: Sequence[Tried]) -> list[Tried]:
-        """One effect more on top of each of `parents`."""
+    def grown(self, parents: Sequence[Tried], afar: Sequence[Tried] = ()) -> list[Tried]:
+        """One effect more on top of each of `parents`; sets of as many found from `afar` too."""
         grown: list[Tried] = []
         far = astray(self.base) and not self.explained
         for parent in parents:
@@ -224,16 +228,17 @@ class _Searching:
                 far=False, progress=lambda share, text: self.report(0.6 + 0.35 * share, text),
             )  # fmt: skip
         if not grown:
-            return []
+            return list(afar)
         if far and not any(t.adequate for t in grown):
             grown = started_again(grown, self.data, self.run)
-        grown = self._led_to_the_end(grown)
+        grown += led_on(grown, self.data, self.run)
+        grown += self._in_other_forms([*grown, *afar])
         # what leaves a misfit is no better for having less in it; the best are shown without
         best = best_by_name(grown)[:SHORTENED]
         for t in grown:
             shorten = t.adequate or any(t is b for b in best)
             self.tried.append(eliminate(t, self.data) if shorten else t)
-        return grown
+        return [*grown, *afar]
 
     def of_more_modes(self, level: Sequence[Tried]) -> list[Tried]:
         """Several modes more, from the data alone, where they leave less than all of `level`: more
@@ -248,14 +253,13 @@ class _Searching:
         self.tried += found
         return [t for t in found if misfit(t) < least]
 
-    def _led_to_the_end(self, grown: Sequence[Tried]) -> list[Tried]:
-        """With what had not converged led on, and, if still nothing explains, in other forms."""
-        out = [*grown, *led_on(grown, self.data, self.run)]
-        if not (self.by_chance or any(t.explains for t in out)):
-            self.report(0.6, "trying other forms of the best")
-            others = reformed(out, self.data, self.forms, self.run, self.done)
-            out += [*others, *led_on(others, self.data, self.run)]
-        return out
+    def _in_other_forms(self, found: Sequence[Tried]) -> list[Tried]:
+        """Other forms of the best of `found`, if nothing explains the data."""
+        if self.by_chance or any(t.explains for t in found):
+            return []
+        self.report(0.6, "trying other forms of the best")
+        others = reformed(found, self.data, self.forms, self.run, self.done)
+        return [*others, *led_on(others, self.data, self.run)]
 
     def with_chance(self, parents: Sequence[Tried]) -> None:
         """Run-to-run scatter beside each of `parents`, and effects beside scatter: where that
@@ -333,7 +337,7 @@ class _Searching:
         """Two effects of the place whose freely shaped piece explains the data; the pieces."""
 
         def report(share: float, text: str) -> None:
-            self.report(0.93 + 0.02 * share, text)
+            self.report(0.6 + 0.05 * share, text)
 
         data, run = self.data, self.run
         pieces = shaped(self.structure, data, self.base, self.tried, run, report)
