@@ -318,7 +318,8 @@ class Whereabouts:
     effect that does better, at each place.
 
     `left` is χ²/dof by place, best first, `before` that of the declared model; `likely` are the
-    places that are not ruled out, none where no place takes up most of the misfit.
+    places that are not ruled out, none where no place takes up most of the misfit. A place where
+    nothing could be fitted is not in `left`, and not ruled out unless another explains it all.
     """
 
     likely: tuple[str, ...]
@@ -331,6 +332,8 @@ class Whereabouts:
         if not self.left:
             return "Where it lies is not known: no freely shaped piece could be fitted."
         listed = ", ".join(f"{place} {left:.3g}" for place, left in self.left.items())
+        unknown = [place for place in self.likely if place not in self.left]
+        listed += f"; no fit: {', '.join(unknown)}" if unknown else ""
         sizes = f"χ²/dof {self.before:.3g}; with a free shape or one effect in one place: {listed}"
         if not self.likely:
             return f"No place in the loop takes it up by itself ({sizes})."

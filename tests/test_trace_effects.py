@@ -560,6 +560,17 @@ def test_a_place_that_takes_up_little_is_ruled_out(monkeypatch: pytest.MonkeyPat
     assert list(where.left) == ["experiment", "nonlinearity", "flame"]
 
 
+def test_a_place_that_could_not_be_shaped_is_not_ruled_out() -> None:
+    """Unless another explains it all."""
+    shape = replace(tried_as(fitted(11, 9.0), "channel_mismatch:skew"), fit_p=0.0)
+    where = whereabouts([shape], [], fitted(10, 500.0))
+    others = ("forward", "flame", "nonlinearity", "actuator", "experiment")
+    assert (where.likely, list(where.left)) == (("sensor", *others), ["sensor"])
+    assert "no fit: forward, flame, nonlinearity, actuator, experiment" in where.words
+    explains = tried_as(fitted(11, 1.0), "channel_mismatch:skew")
+    assert whereabouts([explains], [], fitted(10, 500.0)).likely == ("sensor",)
+
+
 def test_unexplained_says_where(tmp_path: Path) -> None:
     """Without the candidate that it is, a flame delay ends as unexplained, on the flame's side."""
     ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})

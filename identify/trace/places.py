@@ -118,6 +118,8 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
     places = first_of_each(sorted([*pieces, *single], key=misfit), _place)
     left = {place: t.fit.chi2_per_dof for place, t in places.items()}
     likely = _likely(list(places.values()), base.chi2_per_dof)
+    if pieces and likely and not places[likely[0]].adequate:  # no shape there says nothing of it
+        likely += tuple(dict.fromkeys(p.location for p in PIECES if p.location not in left))
     return Whereabouts(likely, left, base.chi2_per_dof)
 
 
