@@ -123,7 +123,7 @@ class Distortion(Effect):
 
     def __init__(self, powers: tuple[int, ...]) -> None:
         self.powers = powers
-        words = {2: "quadratic", 3: "cubic", 4: "quartic", 5: "quintic", 7: "septic"}
+        words = {2: "quadratic", 3: "cubic", 5: "quintic", 7: "septic"}
         self.form = "_".join(words[d] for d in powers)
         self.parameters = tuple(
             Parameter(f"actuator_nonlinearity.a{d}", f"V^-{d - 1}") for d in powers

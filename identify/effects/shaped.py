@@ -76,22 +76,21 @@ class ShapedFlame(Shaped):
 class ShapedActuator(Shaped):
     """Any smooth linear response of the speaker, and its distortion."""
 
-    location, besides = "actuator", DISTORTION.parameters
+    location, distortion = "actuator", DISTORTION
+    besides = distortion.parameters
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
         return self.response(p, s)
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        return DISTORTION.drive(p, at, u)
+        return self.distortion.drive(p, at, u)
 
 
 class CutActuator(ShapedActuator):
     """The same with a distortion as strong as where an amplifier clips."""
 
-    form, besides = "cut_off", CUT_OFF.parameters
-
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        return CUT_OFF.drive(p, at, u)
+    form, distortion = "cut_off", CUT_OFF
+    besides = distortion.parameters
 
 
 class ShapedSensor(Shaped):

@@ -61,8 +61,9 @@ def shaped(
 ) -> list[Tried]:
     """The pieces of each place, started from the declared fit and from what the best of `tried`
     make of the declared model; best first."""
-    every = [piece(data.free_hz, structure.mode_count) for piece in PIECES]
-    pieces = [p for p in every if usable(p, data, structure)]
+    every = (piece(data.free_hz, structure.mode_count) for piece in PIECES)
+    differing = first_of_each(every, lambda p: p.parameters)  # of one mode two are the same
+    pieces = [p for p in differing.values() if usable(p, data, structure)]
     best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]
     bases = [base, *(part_of(t, (), data) for t in best)]
     found = []
@@ -128,11 +129,11 @@ def _shape(item: tuple[Structure, Dataset, Effect, Sequence[Fit]]) -> Fit | None
     noise is as large as the misfit of the worst, if any starts."""
     plain, data, piece, bases = item
     structure, starts = plain.with_effects(piece), list[CoarseStart]()
-    for base in bases:
+    shares = [shares_of(base, data) for base in bases]
+    for base, (share, *_) in zip(bases, shares, strict=True):
         inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
-        share, *_ = shares_of(base, data)
         starts += coarse(structure, data, [np.r_[base.theta, row] for row in inner], share)[:STARTS]
-    first, second, last = max(shares_of(base, data) for base in bases)
+    first, second, last = max(shares)
     led = polish(structure, data, starts, (first, second), 8)[:STARTS]
     if not led:
         return None

@@ -103,12 +103,12 @@ def search(
     level = best_by_name(singles)
     pieces = [] if going.explained or depth < 2 else going.in_one_place()
     in_one_place = any(t.adequate for t in pieces)
+    if in_one_place:  # three effects would stand for one that nobody has named
+        depth = min(depth, 2)
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
-            break
-        if in_one_place and size > 2:  # three would stand for one that nobody has named
             break
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
