@@ -12,6 +12,14 @@ from identify import assess, balance, diagnosis, start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
+from identify.effects.shaped import (
+    LAGS,
+    Shaped,
+    ShapedFlame,
+    ShapedForward,
+    ShapedNonlinearity,
+    lag,
+)
 from identify.executor import InProcess
 from identify.fit import Fit, OrbitResidual, fit_orbits, levenberg_marquardt
 from identify.identification import Prepared
@@ -29,7 +37,7 @@ from identify.trace.selection import (
     against_chance,
     try_scatters,
 )
-from identify.trace.stages import known_sizes
+from identify.trace.stages import by_name, known_sizes
 from identify.trace.tried import tried
 from simulated_rig import build_config
 from simulated_rig.effects import EFFECTS, make_effect
@@ -507,7 +515,9 @@ def test_a_claim_takes_most_of_the_misfit_away(
         ("nonlinear_damping/cubic", {}, "forward"),
         ("flame_delay", {"delay_s": 3e-4}, "flame"),
         ("nonlinearity_shape/quartic", {}, "nonlinearity"),
+        ("nonlinear_damping/quadratic", {"quadratic_per_m": 20.0}, "forward"),
         ("actuator_dynamics/voice_coil", {}, "actuator"),
+        ("actuator_dynamics/voice_coil", {"pole_hz": 150.0}, "actuator"),
         ("actuator_nonlinearity/clipping", {}, "actuator"),
         ("channel_mismatch/gain", {}, "sensor"),
         ("sensor_offset", {"offset_m": 0.056}, "sensor"),
@@ -526,6 +536,33 @@ def test_what_no_candidate_explains_is_placed(
     found = whereabouts(pieces, [], base)
     assert found.likely == (place,), found.words
     assert PLACES[place] in found.words
+
+
+@pytest.mark.parametrize("time", LAGS)
+def test_a_free_shape_starts_as_a_lag(time: float) -> None:
+    """As near as the series, cut off there, leaves it: no |B^j − 1| is above 2."""
+    piece = ShapedFlame(100.0, 2)
+    h = dict(zip((q.name for q in piece.parameters), lag(time), strict=True))
+    s = 2j * np.pi * np.array([90.0, 100.0, 110.0])
+    exact = 1.0 / (1.0 + s * time / piece.corner)
+    *_, before, last = lag(time)
+    ratio = abs(last / before)
+    cut = 2 * abs(last) * ratio / (1 - ratio)
+    np.testing.assert_allclose(piece.response(h, s), exact, rtol=0, atol=cut)
+
+
+@pytest.mark.parametrize("piece", [ShapedNonlinearity, ShapedForward])
+def test_a_free_shape_restated_says_the_same(tmp_path: Path, piece: type[Shaped]) -> None:
+    """Started from the richer structure's values, a piece predicts what that structure does."""
+    ready = thesis_campaign(tmp_path, 7, {})
+    data, shape = ready.data, piece(ready.data.free_hz, ready.structure.mode_count)
+    richer = shape.restated(ready.structure)
+    assert richer is not None
+    theta = next(start.candidates(richer, data))
+    larger = ready.structure.with_effects(shape)
+    same = by_name(shape, larger, richer.parameters.plain(theta))
+    one = start.coarse(richer, data, [theta], 0.01)[0].cost
+    assert start.coarse(larger, data, [same], 0.01)[0].cost == pytest.approx(one, rel=1e-6)
 
 
 def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(

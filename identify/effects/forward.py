@@ -213,8 +213,9 @@ class NonlinearDamping(Effect):
         self.parameters = (*self.own, *self.ratios)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        # a share of the linear loss 2ζω at the amplitude of the forced runs
-        loss = 0.2 * 4 * 3.14159 * known.modes_damping[0] * known.modes_hz[0]
+        # a share of the linear loss 2ζω at the amplitude of the forced runs; a declared fit may
+        # have put all of it down to the flame
+        loss = 0.2 * 4 * np.pi * max(known.modes_damping[0], 0.005) * known.modes_hz[0]
         sizes = [loss / known.velocity_amplitude ** (LOSSES[law][0] - 1) for law in self.laws]
         signs = product((-1.0, 1.0), repeat=len(self.ratios) // 2)
         return [(*sizes, *np.repeat(q, 2).tolist()) for q in signs]

@@ -2,11 +2,12 @@
 
 A linear response is 1 + Σ_j h_j (B^j − 1), B = (ω₀ − s)/(ω₀ + s), j = 1 … 4: powers of an all-pass
 step at the free frequency follow any smooth response and grow nowhere (Laguerre's functions).
-Every piece vanishes where its parameters do. None is a candidate of a diagnosis: they say where
-something lies that no candidate explains (`identify.trace.places`).
+Every piece vanishes where its parameters do, and starts from there and as lags of several sizes.
+None is a candidate of a diagnosis: they say where something lies that no candidate explains
+(`identify.trace.places`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -18,15 +19,23 @@ from identify.effects.forward import AcousticMode, NonlinearDamping
 from identify.effects.nonlinearity import HigherOrder
 from identify.effects.sensor import upper_pressure, with_leak
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Mode, Values
+from identify.structure import Conditions, Effect, Known, Mode, Structure, Values
 
 STEPS = 4
 MODE = AcousticMode()
-LOSS = NonlinearDamping("cubic")
+LOSS = NonlinearDamping("quadratic_cubic")
 DISTORTION = Distortion((2, 3))
 CUT_OFF = Distortion((2, 3, 5, 7))  # at both ends
 POWERS = HigherOrder((4, 5, 6, 7))
+LOWEST, HIGHEST = min(POWERS.powers), max(POWERS.powers)
 WANDERING = ("frequency", "damping", "flame", "speaker")
+LAGS = (0.2, 0.8)  # times of the lags to start from, in 1/ω₀
+
+
+def lag(time: float) -> tuple[float, ...]:
+    """The response's numbers of 1/(1 + s · time/ω₀), whose series in B is geometric."""
+    ratio = (time - 1.0) / (time + 1.0)
+    return tuple(2 * time / (1.0 + time) ** 2 * ratio**j for j in range(STEPS))
 
 
 class Shaped(Effect):
@@ -46,10 +55,14 @@ class Shaped(Effect):
         """What it needs of each of so many declared modes."""
         return ()
 
-    def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(0.0,) * len(self.parameters)]
+    def responses(self) -> list[tuple[float, ...]]:
+        """The linear response's numbers where there is none, and those of lags."""
+        return [(0.0,) * STEPS, *map(lag, LAGS)] if self.linear else [()]
 
-    def neutral(self) -> tuple[float, ...] | None:
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(*h, *self.neutral()[len(h) :]) for h in self.responses()]
+
+    def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.parameters)
 
     def step(self, s: Any) -> Any:
@@ -123,7 +136,7 @@ class ModalSensor(ShapedSensor):
 
 
 class ShapedForward(Shaped):
-    """Any smooth linear response common to flame and speaker, one more mode, and a cubic loss.
+    """Any smooth linear response common to flame and speaker, one more mode, and a loss that grows.
 
     A factor on the acoustics changes the velocity that is measured and that the flame feels.
     """
@@ -133,10 +146,15 @@ class ShapedForward(Shaped):
     loss = LOSS.loss
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(*(0.0,) * STEPS, *row, 0.0) for row in MODE.starts(known)]
+        rows = MODE.starts(known)
+        return [(*h, *row, *LOSS.neutral()) for h in self.responses() for row in rows]
 
-    def neutral(self) -> None:
-        return None
+    def restated(self, structure: Structure) -> Structure | None:
+        return MODE.restated(structure)
+
+    def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
+        found, at = MODE.from_restated(structure, values), -len(MODE.parameters)
+        return [*found[:at], *(0.0,) * STEPS, *found[at:], *LOSS.neutral()]
 
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         return self.response(p, s)
@@ -153,6 +171,14 @@ class ShapedNonlinearity(Shaped):
 
     location, linear, besides = "nonlinearity", False, POWERS.parameters
     characteristic = POWERS.characteristic
+
+    def restated(self, structure: Structure) -> Structure | None:
+        declared = structure.nonlinearity == "polynomial" and structure.degree == LOWEST - 1
+        return replace(structure, degree=HIGHEST) if declared else None
+
+    def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
+        known = [values[q.name] for q in structure.base_parameters]
+        return [*known, *(values[f"nonlinearity.c{d}"] for d in POWERS.powers)]
 
 
 class ShapedExperiment(Shaped):

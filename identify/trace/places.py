@@ -16,17 +16,17 @@ from identify.effects.shaped import PIECES
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.results import Whereabouts
-from identify.start import CoarseStart, coarse, polish
+from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
 from identify.structure import Effect, Structure
 from identify.trace.contests import joins, part_of
-from identify.trace.stages import known_sizes, shares_of, try_effects, usable
+from identify.trace.stages import ROUGH, by_name, known_sizes, shares_of, try_effects, usable
 from identify.trace.tried import EVIDENCE, Tried, best_by_name, first_of_each, misfit
 from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave …
 LITTLE = 0.6  # … and any that is not ruled out
-STARTS = 3
+STARTS, AFAR = 3, 4
 PLACES, PARENTS = 2, 2  # of which two effects are sought together, and from how many first ones
 
 
@@ -125,15 +125,23 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
 
 
 def _shape(item: tuple[Structure, Dataset, Effect, Sequence[Fit]]) -> Fit | None:
-    """The fit of a structure with one piece, from the fits without it that are nearest once the
-    noise is as large as the misfit of the worst, if any starts."""
+    """The fit of a structure with one piece, if any starts: from the fits without it that are
+    nearest once the noise is as large as the misfit of the worst, from the slow flow corrected for
+    what the piece starts as, and from a richer structure that says the same."""
     plain, data, piece, bases = item
-    structure, starts = plain.with_effects(piece), list[CoarseStart]()
+    structure, rough = plain.with_effects(piece), data.coarse()
     shares = [shares_of(base, data) for base in bases]
+    starts = list[CoarseStart]()
     for base, (share, *_) in zip(bases, shares, strict=True):
         inner = [piece.to_internal(row) for row in piece.starts(known_sizes(data, base))]
         starts += coarse(structure, data, [np.r_[base.theta, row] for row in inner], share)[:STARTS]
     first, second, last = max(shares)
+    richer = piece.restated(plain)
+    if richer is not None:
+        found = [richer.parameters.plain(theta) for theta in candidates(richer, data)]
+        starts += coarse(structure, data, [by_name(piece, structure, p) for p in found], first)[:1]
+    distant = physical_starts(structure, rough, piece.starts(known_sizes(data, bases[0])))[:AFAR]
+    starts += polish(structure, rough, distant, (ROUGH,), 8)[:STARTS]
     led = polish(structure, data, starts, (first, second), 8)[:STARTS]
     if not led:
         return None
