@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from identify.record import Medium, Run, Signal
-from identify.report.controller import boundary
+from identify.report.controller import boundary, controller_steps
 from identify.report.equations import equations, equations_text
 from identify.report.misfit import in_noise_units
 from identify.report.spectra import free_frequency, velocity_spectrum
@@ -106,3 +106,16 @@ def _float(word: str) -> float | None:
 
 def _run(signals: dict[str, Signal]) -> Run:
     return Run("r", "forced", RATE, signals, frequency_hz=170.0, amplitude_v=1.0)
+
+
+def test_frequencies_are_written_where_there_is_room() -> None:
+    """Of steps that end in a heap only those stand named that cover no other name or point."""
+    steps = [
+        {"frequency_hz": hz, "amplitude_v": v, "suppression_db": db, "entrained": True}
+        for hz, v, db in ((160.0, 0.1, 40.0), (165.0, 0.50, 80.0), (166.0, 0.51, 80.5),
+                          (170.0, 1.0, 60.0))
+    ]  # fmt: skip
+    left = controller_steps(steps).axes[0]
+    named = {t.get_text() for t in left.texts}
+    assert {"160", "170"} < named
+    assert len({"165", "166"} & named) == 1

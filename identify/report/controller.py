@@ -16,6 +16,7 @@ from identify.report import theme
 
 Steps = Sequence[Mapping[str, Any]]
 REQUIRED_DB = 20.0  # the campaign's requirement on the limit-cycle line
+LABEL_PT = (26.0, 8.0)  # a label's room, points
 
 
 def boundary(steps: Steps) -> list[tuple[float, float, float]]:
@@ -36,6 +37,7 @@ def controller_steps(steps: Steps, free_hz: float | None = None) -> Figure:
     """Suppression against drive amplitude, and all steps in the plane of the tongue."""
     figure, axes = theme.panels(3.0, 1, 2)
     left, right = axes[0]
+    ends: list[tuple[float, float, float]] = []  # frequency, and where its last step stands
     for hz in sorted({float(s["frequency_hz"]) for s in steps}):
         here = [s for s in steps if float(s["frequency_hz"]) == hz]
         known = [s for s in here if s.get("suppression_db") is not None]
@@ -46,10 +48,7 @@ def controller_steps(steps: Steps, free_hz: float | None = None) -> Figure:
         for v, db, s in zip(volts, level, known, strict=True):
             _mark(left, v, db, bool(s["entrained"]))
         if volts:
-            left.annotate(
-                f"{hz:g}", (volts[-1], level[-1]), xytext=(4, 0), textcoords="offset points",
-                fontsize=6.5, color=theme.MUTED, va="center",
-            )  # fmt: skip
+            ends.append((hz, volts[-1], level[-1]))
         line.set_label("")
     left.axhline(REQUIRED_DB, color=theme.BEFORE, lw=0.9, ls="--")
     left.annotate(
@@ -74,10 +73,29 @@ def controller_steps(steps: Steps, free_hz: float | None = None) -> Figure:
     right.legend(loc="lower left", bbox_to_anchor=(0, 1.0), ncols=2, borderaxespad=0.1)
     right.set_ylim(bottom=0)
     left.set_xlim(left=0)
+    _label(left, ends)
     theme.name_axes(left, "drive amplitude (V)", "limit cycle below its free level (dB)")
     left.set_title("Steps, by forcing frequency (Hz)")
     theme.name_axes(right, "forcing frequency (Hz)", "drive amplitude (V)")
     return figure
+
+
+def _label(ax: Any, ends: Sequence[tuple[float, float, float]]) -> None:
+    """Frequencies beside the points they belong to, as far as there is room: the tongue beside
+    them holds all."""
+    at = np.array([ax.transData.transform(end[1:]) for end in ends]) * 72 / ax.figure.dpi
+    placed = np.empty((0, 2))
+    for i, (hz, volts, level) in enumerate(ends):
+        points, labels = np.delete(at, i, axis=0) - at[i], placed - at[i]
+        high = np.abs(points[:, 1]) < LABEL_PT[1]
+        covers = high & (points[:, 0] > 0) & (points[:, 0] < LABEL_PT[0])
+        if covers.any() or (np.abs(labels) < LABEL_PT).all(axis=1).any():
+            continue
+        placed = np.vstack([placed, at[i]])
+        ax.annotate(
+            f"{hz:g}", (volts, level), xytext=(4, 0), textcoords="offset points",
+            fontsize=6.5, color=theme.MUTED, va="center",
+        )  # fmt: skip
 
 
 def _mark(ax: Any, x: float, y: float, entrained: bool) -> None:
