@@ -34,7 +34,8 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
-HOPE = 20  # iterations for what may be given up as hopeless
+HOPE = 20  # iterations for what may be given up as hopeless …
+SHORTLY = 10  # … and for fits of which only those near to the noise matter
 VALLEY = 20  # iterations after which a descent is taken to follow one
 PROBE = 0.3  # of a step, where its curvature is looked at
 BENT = 0.4  # of the step that the bend may be
@@ -427,6 +428,7 @@ def levenberg_marquardt(
     damping: float = 1e-3,
     patience: int = 12,
     hopeless: float = np.inf,
+    hope: int = HOPE,
     bounds: tuple[FloatArray, FloatArray] | None = None,
 ) -> list[Descent | None]:
     """Minimise |ρ(θ)|² from each of `thetas`, (starts, p), side by side.
@@ -435,8 +437,8 @@ def levenberg_marquardt(
     step still to come would lower χ² by less than `tolerance` (absolute and relative): a hundredth
     of what a thousandth of a standard error is worth. Unknowns are scaled by the Jacobian's
     columns (Marquardt), damping follows the gain ratio (Nielsen); a descent ends after more than
-    `patience` refused steps in a row, or where after `HOPE` iterations |ρ|² is still beyond
-    `hopeless`. Unknowns at a bound that the gradient pushes against are
+    `patience` refused steps in a row, or where after `hope` iterations even what its tangents
+    promise of |ρ|² is beyond `hopeless`. Unknowns at a bound that the gradient pushes against are
     held there; `bounds` are (p,) each, or (starts, p).
     """
     count, p = thetas.shape
@@ -456,10 +458,7 @@ def levenberg_marquardt(
         active = [(n, s) for n, s in enumerate(states) if s is not None and s.ended is None]
         trials, steps = [], []
         for n, s in active:
-            if s.iterations > HOPE and s.cost > hopeless:
-                s.ended = "given up far from any solution"
-                continue
-            step = _propose(s, low[n], high[n], tolerance, iterations, patience)
+            step = _propose(s, low[n], high[n], tolerance, iterations, patience, hopeless, hope)
             if step is not None:
                 trials.append((n, s))
                 steps.append(step)
@@ -508,6 +507,8 @@ def _propose(
     tolerance: float,
     iterations: int,
     patience: int,
+    hopeless: float,
+    hope: int,
 ) -> tuple[FloatArray, float] | None:
     """The next step of a descent and its predicted decrease, or None where it has ended."""
     if s.refused == 0:
@@ -522,6 +523,9 @@ def _propose(
     if s.refused > patience:
         s.converged = promise < 1e-3 * enough
         s.ended = "converged" if s.converged else "no step lowers the misfit any further"
+        return None
+    if s.iterations > hope and s.cost - promise > hopeless:
+        s.ended = "given up far from any solution"
         return None
     if s.iterations > iterations:
         s.ended = f"not converged in {iterations} iterations"
@@ -581,10 +585,12 @@ def fit_orbits(
     *,
     continuation: Sequence[float] = (0.03, 0.003, 0.0),
     iterations: int = 60,
+    hopeless: float = np.inf,
 ) -> Fit:
     """Maximum-likelihood fit from one start (p,) or several (starts, p); the best one is returned.
 
-    Each is led in by decreasing `continuation` shares, the last of which must be 0.
+    Each is led in by decreasing `continuation` shares, the last of which must be 0. It ends early
+    where its tangents promise no less than `hopeless` times what noise leaves.
     """
     current = np.atleast_2d(thetas)
     batches = [b.balanced(structure) for b in data.fit]
@@ -599,6 +605,8 @@ def fit_orbits(
             straight.inside(current),
             iterations=iterations if last else 20,
             tolerance=1e-6 if last else 1e-2,
+            hopeless=hopeless * data.residuals,
+            hope=SHORTLY,
             bounds=straight.bounds(structure),
         )
         if last:

@@ -19,7 +19,14 @@ from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
 from identify.structure import MODAL, Effect, Structure
-from identify.trace.stages import beside, known_sizes, louder, loudness, try_effects
+from identify.trace.stages import (
+    NO_RIVAL,
+    beside,
+    known_sizes,
+    louder,
+    loudness,
+    try_effects,
+)
 from identify.trace.tried import (
     ALPHA,
     EVIDENCE,
@@ -217,7 +224,11 @@ def _in_form(item: _Exchange) -> Fit | None:
     fits = []
     if starts:
         first = np.stack([s.theta for s in starts])
-        fits.append(fit_orbits(larger, data, first, continuation=(0.003, 0.0), iterations=30))
+        bar = NO_RIVAL if t.explains else np.inf  # of rivals only those near to the noise matter
+        steps = (0.003, 0.0)
+        fits.append(
+            fit_orbits(larger, data, first, continuation=steps, iterations=30, hopeless=bar)
+        )
     if taken:  # what `t` knows to within the noise, coarse noise would lose
         fits.append(fit_orbits(larger, data, np.stack(taken), continuation=(0.0,), iterations=30))
     return min(fits, key=lambda f: f.chi2, default=None)
@@ -445,7 +456,7 @@ def in_their_places(
         out += try_effects(
             base.structure, data, base,
             [a for a in available if a.name not in names and a.key not in already],
-            executor=run, keep=5, far=False, scores=None if kept else {},
+            executor=run, keep=5, far=False, scores=None if kept else {}, rivals=True,
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
     return [eliminate(t, data) if t.explains else t for t in out]

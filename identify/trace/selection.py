@@ -58,6 +58,7 @@ FOREMOST = 2  # laws seen there beside which chance is tried
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought, and chance, from afar
 STANDS_OUT = 30.0  # times less misfit than with any other effect
+NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
 
@@ -271,6 +272,8 @@ class _Searching:
         for parent in [] if self.by_chance else parents:
             if by_law and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
+            if by_law and parent.fit.chi2_per_dof > NO_CHANCE:
+                continue  # nor can what takes that much up be chance
             found = self._scattered(parent.fit.structure, parent.fit)
             found += _simpler_beside_chance(found, data, self.apart, run)
             self._add_beside_chance(found)
@@ -555,7 +558,7 @@ def _beside_the_same_chance(
         return []
     others = [a for a in available if a.name != law.name]
     found = try_effects(
-        base.structure, wide, base, others, executor=run, keep=5, far=False,
+        base.structure, wide, base, others, executor=run, keep=5, far=False, rivals=True,
         progress=lambda share, text: report(0.95 + 0.05 * share, text),
     )  # fmt: skip
     out: list[Tried] = []

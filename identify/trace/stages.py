@@ -43,6 +43,7 @@ PROMISED = 0.4  # share of χ² that a small effect would take away: refitted st
 OF_MODES = 48  # starts of one more mode, which may be anywhere and of either sign
 SHAPES = 4  # so many are started from of an effect whose shape is unknown
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
+NO_RIVAL = 30.0  # times what noise leaves: what promises no less is none of what explains the data
 FINE = 0.015  # share of noise below which all harmonics are looked at
 
 
@@ -81,6 +82,7 @@ class _Task:
     known: Known
     shares: tuple[float, float, float]  # of each coefficient's size that count as noise, by stage
     score: ScoreTest | None
+    hopeless: float = np.inf  # times what noise leaves, where nothing else matters
     placements: tuple[tuple[float, ...], ...] = ()
 
     @property
@@ -183,7 +185,8 @@ def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     task, starts = item
     larger = task.structure.with_effects(task.effect)
     thetas = np.stack([s.theta for s in starts])
-    fit = fit_orbits(larger, task.data, thetas, continuation=(task.shares[2], 0.0))
+    steps = (task.shares[2], 0.0)
+    fit = fit_orbits(larger, task.data, thetas, continuation=steps, hopeless=task.hopeless)
     return canonical(fit, task.data)
 
 
@@ -218,7 +221,8 @@ def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
     task, rows = item
     larger = task.structure.with_effects(task.effect)
     thetas = np.stack([np.r_[task.base.theta, row] for row in rows])
-    return canonical(fit_orbits(larger, task.data, thetas, continuation=(0.0,)), task.data)
+    fit = fit_orbits(larger, task.data, thetas, continuation=(0.0,), hopeless=task.hopeless)
+    return canonical(fit, task.data)
 
 
 def _balanced(task: _Task) -> Fit | None:
@@ -295,19 +299,23 @@ def try_effects(
     far: bool,
     progress: Callable[[float, str], None],
     scores: Mapping[str, ScoreTest] | None = None,
+    rivals: bool = False,
 ) -> list[Tried]:
     """Each effect added to `structure`; the best `keep` are refitted in full, best first.
 
     Started near the `base` fit; with `far` from the slow flow too, where none comes of that.
-    `scores` are the effects' tests at the base fit, where they are known already.
+    `scores` are the effects' tests at the base fit, where they are known already. Sought as
+    `rivals` of what explains the data, those that come nowhere near the noise are given up early.
     """
     if scores is None:
         scores = score_tests(structure, data, base, effects, executor)
     known = known_sizes(data, base)
     rough = data.coarse()
     shares = shares_of(base, data)
+    hopeless = NO_RIVAL if rivals else np.inf
     tasks = [
-        _Task(structure, data, rough, base, e, known, shares, scores.get(e.key)) for e in effects
+        _Task(structure, data, rough, base, e, known, shares, scores.get(e.key), hopeless)
+        for e in effects
     ]
     staged: list[tuple[_Task, list[CoarseStart]]] = []
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
