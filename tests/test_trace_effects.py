@@ -637,6 +637,19 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     assert trace.rivals(other, [replace(beside, validation_p=1e-17)]) == []
 
 
+def test_a_gross_misfit_of_one_place_is_sought_nowhere_else(tmp_path: Path) -> None:
+    """A voice coil that no candidate names: the actuator's free shape explains it, and no other."""
+    ready = thesis_campaign(tmp_path, 7, {"actuator_dynamics/voice_coil": {"pole_hz": 150.0}})
+    others = [
+        by_key(k) for k in ("channel_mismatch:gain", "sensor_dynamics:lowpass", "flame_delay")
+    ]
+    found = identify.diagnose(ready.campaign, catalogue=others)
+    assert found.verdict == "unexplained"
+    assert found.whereabouts is not None
+    assert found.whereabouts.likely == ("actuator",)
+    assert {len(c.effects) for c in found.candidates} == {1}
+
+
 def test_fitted_and_held_out_runs_speak_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fitted and held-out runs that noise alone hardly leaves, each for itself, refuse what both
     were to be explained by; and what predicts them better is a rival, if of more parameters."""

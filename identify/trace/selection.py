@@ -103,9 +103,12 @@ def search(
     singles = going.alone(scores)
     level = best_by_name(singles)
     pieces = [] if going.explained or depth < 2 else going.in_one_place()
-    in_one_place = any(t.adequate for t in pieces)
-    if in_one_place:  # three effects would stand for one that nobody has named
+    places = {t.effects[0].location for t in pieces if t.adequate}
+    in_one_place = bool(places)
+    if in_one_place:  # three effects would stand for one that nobody has named …
         depth = min(depth, 2)
+    if len(places) == 1 and _least(singles) > GROSS:  # … and so would two, with none that is near
+        depth = 1
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
