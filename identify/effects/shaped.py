@@ -60,9 +60,10 @@ class Shaped(Effect):
         return [(0.0,) * STEPS, *map(lag, LAGS)] if self.linear else [()]
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(*h, *self.neutral()[len(h) :]) for h in self.responses()]
+        rest = (0.0,) * (len(self.parameters) - len(self.responses()[0]))
+        return [(*h, *rest) for h in self.responses()]
 
-    def neutral(self) -> tuple[float, ...]:
+    def neutral(self) -> tuple[float, ...] | None:
         return (0.0,) * len(self.parameters)
 
     def step(self, s: Any) -> Any:
@@ -148,6 +149,9 @@ class ShapedForward(Shaped):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         rows = MODE.starts(known)
         return [(*h, *row, *LOSS.neutral()) for h in self.responses() for row in rows]
+
+    def neutral(self) -> None:
+        return None
 
     def restated(self, structure: Structure) -> Structure | None:
         return MODE.restated(structure)

@@ -17,7 +17,7 @@ from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Effect, Known, Structure
-from identify.trace.stages import OF_MODES, by_name, canonical, known_sizes, likely_placements
+from identify.trace.stages import OF_MODES, canonical, known_sizes, likely_placements, renamed
 from identify.trace.tried import Tried, tried
 
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
@@ -157,8 +157,7 @@ def _refit(led: _Led) -> Fit:
     pair, thetas = led.pair, [s.theta for s in led.starts]
     structure = pair.plain.with_effects(*pair.effects)
     if pair.richer is not None:
-        found = map(pair.sought.parameters.plain, thetas)
-        thetas = [by_name(pair.effects[0], structure, p) for p in found]
+        thetas = renamed(pair.effects[0], structure, pair.sought, thetas)
     fit = fit_orbits(structure, pair.data, np.stack(thetas), continuation=(0.003, 0.0))
     return canonical(fit, pair.data)
 

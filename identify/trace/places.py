@@ -19,14 +19,14 @@ from identify.results import Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
 from identify.structure import Effect, Structure
 from identify.trace.contests import joins, part_of
-from identify.trace.stages import ROUGH, by_name, known_sizes, shares_of, try_effects, usable
+from identify.trace.stages import ROUGH, known_sizes, renamed, shares_of, try_effects, usable
 from identify.trace.tried import EVIDENCE, Tried, best_by_name, first_of_each, misfit
 from identify.trace.tried import tried as as_tried
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave …
 LITTLE = 0.6  # … and any that is not ruled out
-STARTS, AFAR = 3, 4
+STARTS, AFAR = 3, 4  # that are led on, of each kind; that are looked at from afar
 PLACES, PARENTS = 2, 2  # of which two effects are sought together, and from how many first ones
 
 
@@ -138,8 +138,8 @@ def _shape(item: tuple[Structure, Dataset, Effect, Sequence[Fit]]) -> Fit | None
     first, second, last = max(shares)
     richer = piece.restated(plain)
     if richer is not None:
-        found = [richer.parameters.plain(theta) for theta in candidates(richer, data)]
-        starts += coarse(structure, data, [by_name(piece, structure, p) for p in found], first)[:1]
+        same = renamed(piece, structure, richer, candidates(richer, data))
+        starts += coarse(structure, data, same, first)[:1]
     distant = physical_starts(structure, rough, piece.starts(known_sizes(data, bases[0])))[:AFAR]
     starts += polish(structure, rough, distant, (ROUGH,), 8)[:STARTS]
     led = polish(structure, data, starts, (first, second), 8)[:STARTS]

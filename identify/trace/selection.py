@@ -104,8 +104,7 @@ def search(
     level = best_by_name(singles)
     pieces = [] if going.explained or depth < 2 else going.in_one_place()
     places = {t.effects[0].location for t in pieces if t.adequate}
-    in_one_place = bool(places)
-    if in_one_place:  # three effects would stand for one that nobody has named …
+    if places:  # three effects would stand for one that nobody has named …
         depth = min(depth, 2)
     if len(places) == 1 and _least(singles) > GROSS:  # … and so would two, with none that is near
         depth = 1
@@ -117,14 +116,14 @@ def search(
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
-        nowhere = size == 2 and not (in_one_place or _a_place_to_grow_from(singles, base))
+        nowhere = size == 2 and not (places or _a_place_to_grow_from(singles, base))
         found = going.pairs(singles) if nowhere else []
         if not going.explained or not nowhere:
             found = going.grown(parents, found)
         if size == 2:
             going.with_chance(parents)
             far = base.chi2_per_dof > GROSS and _least(found) > MUCH
-            if far and not (nowhere or in_one_place):
+            if far and not (nowhere or places):
                 found += going.pairs(singles)
         level = best_by_name(found)
         if size == 2 and not going.explained:

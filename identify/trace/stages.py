@@ -146,17 +146,10 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
     first = task.shares[0]
     starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
     if task.richer is not None:
-        rows = _named(task, [s.theta for s in every_start(task.richer, task.rough)[:6]])
+        begun = every_start(task.richer, task.rough)[:6]
+        rows = renamed(task.effect, larger, task.richer, [s.theta for s in begun])
         starts += polish(larger, task.rough, coarse(larger, task.rough, rows), (ROUGH,), 8)[:2]
     return polish(larger, task.seen, starts, (first,), 8)[:3]
-
-
-def _named(task: _Task, thetas: Iterable[FloatArray]) -> list[FloatArray]:
-    """Unknowns with the effect from those of the richer structure."""
-    assert task.richer is not None
-    larger = task.structure.with_effects(task.effect)
-    found = [task.richer.parameters.plain(theta) for theta in thetas]
-    return [by_name(task.effect, larger, p) for p in found]
 
 
 def _from_afar(task: _Task) -> list[CoarseStart]:
@@ -169,7 +162,8 @@ def _from_afar(task: _Task) -> list[CoarseStart]:
         dense = dense_placements(task.richer.mode_count - 1)
         signed = signed_starts(task.richer, task.rough, placements=dense)[:OF_MODES]
         found = polish(task.richer, task.rough, signed, (ROUGH,), 6)[:2]
-        starts += coarse(larger, task.rough, _named(task, [s.theta for s in found]))
+        same = renamed(task.effect, larger, task.richer, [s.theta for s in found])
+        starts += coarse(larger, task.rough, same)
     led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
     return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
 
@@ -229,7 +223,8 @@ def _balanced(task: _Task) -> Fit | None:
     """From the polynomial balance of the richer structure, exact where nothing else is lacking."""
     assert task.richer is not None
     larger = task.structure.with_effects(task.effect)
-    starts = coarse(larger, task.data, _named(task, candidates(task.richer, task.data)))
+    found = candidates(task.richer, task.data)
+    starts = coarse(larger, task.data, renamed(task.effect, larger, task.richer, found))
     if not starts:
         return None
     return canonical(fit_orbits(larger, task.data, starts[0].theta), task.data)
@@ -269,6 +264,14 @@ def by_name(effect: Effect, larger: Structure, p: Mapping[str, float]) -> FloatA
     names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
     now = {**p, **dict(zip(names, effect.from_restated(plain, p), strict=True))}
     return larger.parameters.to_internal([now[n] for n in larger.parameters.names])
+
+
+def renamed(
+    effect: Effect, larger: Structure, richer: Structure, thetas: Iterable[FloatArray]
+) -> list[FloatArray]:
+    """Unknowns of `larger`, of which `effect` is one, from those of the `richer` structure that
+    says the same."""
+    return [by_name(effect, larger, richer.parameters.plain(theta)) for theta in thetas]
 
 
 def shares_of(base: Fit, data: Dataset) -> tuple[float, float, float]:
