@@ -344,6 +344,11 @@ def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
     """∂N̂/∂x of one nonlinearity, (runs, K, 2K)."""
     if not isinstance(n, Preceded):
         return _from_slope(slope_along(n, to_time(v, K)), K)
+    if n.mixes:
+        seeded = np.broadcast_to(
+            np.concatenate([np.eye(K), 1j * np.eye(K)], axis=1), (*v.shape, 2 * K)
+        )
+        return np.asarray(dual.derivative(_force(n, Dual(v, seeded), K), v.shape, 2 * K))
     x, own = to_time(v, K, FINE), np.arange(FINE)
     # an output may follow the input of another time: its slope by both seeds says which
     seeds = np.stack([np.ones(FINE), own], axis=1)

@@ -111,27 +111,36 @@ def diagnose(
     if not declared.significant:
         tried = []
 
+    def placing(share: float, text: str) -> None:
+        report(0.95 + 0.04 * share, text)
+
     @cache
     def pieces() -> list[Tried]:
         seen, begun, shapes = searched
         if seen is data and ((begun is base and shapes) or any(t.adequate for t in shapes)):
             return list(shapes)
-        return trace.shaped(
-            ready.structure, data, base, tried, run,
-            lambda share, text: report(0.95 + 0.04 * share, text),
-        )  # fmt: skip
+        return trace.shaped(ready.structure, data, base, tried, run, placing)
+
+    def deviating(rivalled: Tried | None = None) -> list[Tried]:
+        placing(1.0, "trying runs that deviate at each place")
+        return trace.deviating(ready.structure, data, base, run, rivalled)
 
     verdict, chosen, explanation = _judge(declared, tried, data)
     if chosen is not None and (chosen.fit_p < DOUBTFUL or chosen.spread or len(chosen.effects) > 1):
         # a spread takes up much, and so may laws: not where one does better that nobody knows
         tried = trace.against_chance(tried, pieces())
-        verdict, chosen, explanation = _judge(declared, tried, data, pieces())
+        rivals = [*pieces(), *(deviating(chosen) if chosen.spread else ())]
+        verdict, chosen, explanation = _judge(declared, tried, data, rivals)
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
     where = None
     if verdict == "unexplained":
-        where = trace.whereabouts(pieces(), tried, base)
+        asked = list(pieces())
+        if not any(t.adequate for t in asked):
+            asked += trace.remembering(ready.structure, data, base, run, placing)
+            asked += deviating()
+        where = trace.whereabouts(asked, tried, base)
         explanation = f"{explanation} {where.words}"
     after = before if chosen is None else _after(chosen, data, before.noise_floor)
     before, after = _with_lock_in(before, after, data, run)

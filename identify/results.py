@@ -320,11 +320,13 @@ class Whereabouts:
     `left` is χ²/dof by place, best first, `before` that of the declared model; `likely` are the
     places that are not ruled out, none where no place takes up most of the misfit. A place where
     nothing could be fitted is not in `left`, and not ruled out unless another explains it all.
+    `from_run_to_run`: no law takes it up, but runs that each deviate at a likely place do.
     """
 
     likely: tuple[str, ...]
     left: Mapping[str, float]
     before: float
+    from_run_to_run: bool = False
 
     @property
     def words(self) -> str:
@@ -339,13 +341,15 @@ class Whereabouts:
             return f"No place in the loop takes it up by itself ({sizes})."
         sure = "lies" if len(self.likely) == 1 else "may lie"
         where = " or the ".join(PLACES[p] for p in self.likely)
-        return f"What is missing {sure} in the {where} ({sizes})."
+        how = "differs from run to run and " if self.from_run_to_run else ""
+        return f"What is missing {how}{sure} in the {where} ({sizes})."
 
     def to_json(self) -> dict[str, Any]:
         return {
             "likely": list(self.likely),
             "chi2_per_dof": {place: number(left) for place, left in self.left.items()},
             "before": number(self.before),
+            "from_run_to_run": self.from_run_to_run,
         }
 
 

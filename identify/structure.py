@@ -120,11 +120,13 @@ class Preceded:
     """A characteristic with an operator before it that has corners or remembers, and so needs
     whole periods, finely sampled.
 
-    Called like any other it is the curve alone (small signals, plots of N).
+    Called like any other it is the curve alone (small signals, plots of N). `mixes`: whether the
+    operator's output follows the input of several times at once.
     """
 
     curve: Characteristic
     operator: Characteristic
+    mixes: bool = False
 
     def __call__(self, w: Any) -> Any:
         return self.curve(w)
@@ -174,6 +176,7 @@ class Effect:
     located: tuple[str, ...] = ()  # parameters known to within their size, or it is not seen at all
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
+    mixes: bool = False  # its `operator`'s output follows the input of several times at once
 
     def starts(self, known: "Known") -> list[tuple[float, ...]]:
         raise NotImplementedError(f"effect {self.name!r} proposes no starting values")
@@ -462,7 +465,7 @@ class Structure:
             n = e.characteristic(p, n, at)
         for e in self.effects:
             if (operator := e.operator(p)) is not None:
-                n = Preceded(n, operator)
+                n = Preceded(n, operator, e.mixes)
         return n
 
     def flame_path(self, p: Values, at: Conditions, s: Any) -> Any:

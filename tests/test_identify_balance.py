@@ -9,6 +9,7 @@ import pytest
 from identify import balance
 from identify.dual import Dual
 from identify.effects import by_key
+from identify.effects.shaped import ShapedMemory
 from identify.polynomial import Polynomial
 from identify.structure import Characteristic, Conditions, Loop, Structure, declared_modes
 from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
@@ -110,6 +111,22 @@ def test_slopes_of_what_is_sampled_agree_with_differences(form: str) -> None:
         h[j % K] = 1e-4 if j < K else 1e-4j
         up, down = balance._force(n, v + h, K), balance._force(n, v - h, K)
         # corners move by less than a sample of 1024: no sample changes sides but by chance
+        np.testing.assert_allclose((up - down) / 2e-4, exact[:, :, j], atol=2e-6)
+
+
+def test_slopes_of_a_memory_of_several_plays_agree_with_differences() -> None:
+    """At each moment its output follows the input of several."""
+    effect = ShapedMemory(FREE_HZ, 2)
+    rng = np.random.default_rng(3)
+    v = rng.normal(size=(2, K)) * 3000 / np.arange(1, K + 1) + 1j * rng.normal(size=(2, K)) * 300
+    own = dict(zip((q.name for q in effect.parameters), (800.0, 0.5, -0.7, 0.9), strict=True))
+    structure = Structure(effects=(effect,))
+    (n,) = structure.characteristics({**true_values(), **own}, forced_conditions())
+    exact = balance._force_jacobian(n, v, K)
+    for j in range(2 * K):
+        h = np.zeros(K, dtype=complex)
+        h[j % K] = 1e-4 if j < K else 1e-4j
+        up, down = balance._force(n, v + h, K), balance._force(n, v - h, K)
         np.testing.assert_allclose((up - down) / 2e-4, exact[:, :, j], atol=2e-6)
 
 

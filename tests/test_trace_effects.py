@@ -29,15 +29,14 @@ from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
 from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
-from identify.trace.places import shaped, whereabouts
+from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import scan
 from identify.trace.selection import (
     _other_forms_beside_chance,
     _without_law,
     against_chance,
-    try_scatters,
 )
-from identify.trace.stages import by_name, known_sizes
+from identify.trace.stages import by_name, known_sizes, try_scatters
 from identify.trace.tried import tried
 from simulated_rig import build_config
 from simulated_rig.effects import EFFECTS, make_effect
@@ -568,12 +567,16 @@ def test_a_free_shape_restated_says_the_same(tmp_path: Path, piece: type[Shaped]
 def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
     tmp_path: Path,
 ) -> None:
-    """Hysteresis follows no power of the flame's input: the pieces of other places take more."""
+    """Hysteresis follows no power of the flame's input: the smooth pieces of other places take
+    more, and what remembers takes it all."""
     ready = thesis_campaign(tmp_path, 7, {"nonlinearity_shape": {"hysteresis_width": 0.0063}})
     base = start.fit_from_data(ready.structure, ready.data)
     run, silent = InProcess(), lambda share, text: None
     pieces = shaped(ready.structure, ready.data, base, [], run, silent)
     assert whereabouts(pieces, [], base).likely != ("nonlinearity",)
+    memory = remembering(ready.structure, ready.data, base, run, silent)
+    assert [t.adequate for t in memory] == [True]
+    assert whereabouts([*pieces, *memory], [], base).likely == ("nonlinearity",)
     tries = trace.try_effects(
         ready.structure, ready.data, base, [by_key("nonlinearity_shape:hysteresis")],
         executor=run, keep=1, far=False, progress=silent,
@@ -581,6 +584,47 @@ def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
     found = whereabouts(pieces, tries, base)
     assert found.likely == ("nonlinearity",), found.words
     assert found.left["nonlinearity"] == tries[0].fit.chi2_per_dof
+
+
+@pytest.mark.parametrize(
+    ("key", "parameters", "places"),
+    [
+        # a shift of the drive in time is one of the record, and their gains act nearly alike
+        ("drive_scatter", {"gain_rms": 0.004, "phase_rms_rad": 0.004}, {"actuator", "sensor"}),
+        ("flame_gain_modulation", {"modulation_rms": 0.02, "corner_hz": 2.0}, {"flame"}),
+        ("parameter_drift/frequency_walk", {"frequency_walk": 0.0005}, {"experiment"}),
+    ],
+)
+def test_runs_that_deviate_are_placed(
+    tmp_path: Path, key: str, parameters: dict[str, float], places: set[str]
+) -> None:
+    """No law takes up what differs from run to run; runs that each deviate there do."""
+    ready = thesis_campaign(tmp_path, 7, {key: parameters})
+    base = start.fit_from_data(ready.structure, ready.data)
+    run = InProcess()
+    laws = shaped(ready.structure, ready.data, base, [], run, lambda share, text: None)
+    assert not any(t.adequate for t in laws)
+    deviations = deviating(ready.structure, ready.data, base, run)
+    found = whereabouts([*laws, *deviations], [], base)
+    assert set(found.likely) == places, found.words
+    assert found.from_run_to_run
+    assert "differs from run to run and " in found.words
+    assert all(found.left[p] < 1.5 < min(t.fit.chi2_per_dof for t in laws) for p in places)
+    assert found.to_json()["from_run_to_run"] is True
+
+
+def test_a_law_that_explains_needs_no_run_to_deviate(tmp_path: Path) -> None:
+    """Whatever a spread takes up: a place where a law says it all is where it lies."""
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
+    base = start.fit_from_data(ready.structure, ready.data)
+    run = InProcess()
+    deviations = deviating(ready.structure, ready.data, base, run)
+    law = trace.try_effects(
+        ready.structure, ready.data, base, [by_key("flame_delay")], executor=run, keep=1,
+        far=False, progress=lambda share, text: None,
+    )  # fmt: skip
+    found = whereabouts(deviations, law, base)
+    assert (found.likely, found.from_run_to_run) == (("flame",), False)
 
 
 def test_a_place_that_takes_up_little_is_ruled_out(monkeypatch: pytest.MonkeyPatch) -> None:

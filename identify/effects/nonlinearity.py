@@ -168,22 +168,22 @@ class Hysteresis(Effect):
         return [(q * known.flame_input_amplitude,) for q in (0.002, 0.02, 0.1)]
 
     def operator(self, p: Values) -> Characteristic:
-        width = p["nonlinearity_shape.width"]
+        return lambda w: play(w, p["nonlinearity_shape.width"])
 
-        def play(w: Any) -> Any:
-            x = np.ascontiguousarray(dual.value(w))
-            half = np.ascontiguousarray(
-                np.broadcast_to(dual.value(width), (x.shape[0], 1))[:, 0], dtype=np.float64
-            )
-            at, side = _contacts(x, half)
-            row = np.arange(x.shape[0])[:, None]
-            y = x[row, at] + side * half[:, None]
-            # what was touched last is remembered: value and derivative of that moment
-            touched = None if not isinstance(w, Dual) else Dual(x[row, at], w.d[row, at])
-            one = np.ones_like(y)
-            return dual.chain(y, (one, touched), (side, width))
 
-        return play
+def play(w: Any, width: Any) -> Any:
+    """The play operator over one period of samples `w` (runs, samples), of half-width `width`."""
+    x = np.ascontiguousarray(dual.value(w))
+    half = np.ascontiguousarray(
+        np.broadcast_to(dual.value(width), (x.shape[0], 1))[:, 0], dtype=np.float64
+    )
+    at, side = _contacts(x, half)
+    row = np.arange(x.shape[0])[:, None]
+    y = x[row, at] + side * half[:, None]
+    # what was touched last is remembered: value and derivative of that moment
+    touched = None if not isinstance(w, Dual) else Dual(x[row, at], w.d[row, at])
+    one = np.ones_like(y)
+    return dual.chain(y, (one, touched), (side, width))
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]

@@ -6,6 +6,7 @@ Deviations along a direction add up: twice 0.1 is 0.2, so that a ratio is named 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,18 @@ class DrivePhase(Direction):
     def generator(self, p: Values, at: Conditions) -> Any:
         orders = np.arange(1, at.harmonics + 1)
         return dual.exp(p["drive_phase.shift"] * (-1j * orders))
+
+
+class SensorGain(Direction):
+    """The velocity is measured as more than it is: the logarithm of the ratio."""
+
+    name, location = "sensor_gain", "sensor"
+    parameters = (Parameter("sensor_gain.log_ratio", "1", scale=1e-2),)
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        gain = dual.exp(p["sensor_gain.log_ratio"])
+        known = ((m, 1.0 if m.sensor_ratio is None else m.sensor_ratio) for m in modes)
+        return [replace(m, sensor_ratio=gain * ratio) for m, ratio in known]
 
 
 SCATTERS: tuple[Scatter, ...] = (

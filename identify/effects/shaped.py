@@ -4,7 +4,8 @@ A linear response is 1 + Σ_j h_j (B^j − 1), B = (ω₀ − s)/(ω₀ + s), j 
 step at the free frequency follow any smooth response and grow nowhere (Laguerre's functions).
 Every piece vanishes where its parameters do, and starts from there and as lags of several sizes.
 None is a candidate of a diagnosis: they say where something lies that no candidate explains
-(`identify.trace.places`).
+(`identify.trace.places`). What no smooth law takes up may remember (`ShapedMemory`), or differ from
+run to run by chance (`CHANCES`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,10 +17,19 @@ import numpy as np
 from identify.effects.actuator import Distortion
 from identify.effects.experiment import course
 from identify.effects.forward import AcousticMode, NonlinearDamping
-from identify.effects.nonlinearity import HigherOrder
+from identify.effects.nonlinearity import HigherOrder, play
+from identify.effects.scatter import Change, DriveGain, DrivePhase, Scatter, SensorGain
 from identify.effects.sensor import upper_pressure, with_leak
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Mode, Structure, Values
+from identify.structure import (
+    Characteristic,
+    Conditions,
+    Effect,
+    Known,
+    Mode,
+    Structure,
+    Values,
+)
 
 STEPS = 4
 MODE = AcousticMode()
@@ -185,6 +195,35 @@ class ShapedNonlinearity(Shaped):
         return [*known, *(values[f"nonlinearity.c{d}"] for d in POWERS.powers)]
 
 
+class ShapedMemory(Shaped):
+    """A rate-independent memory of the flame's input: w + Σ_j a_j (P_j(w) − w) of plays P_j, each
+    half as wide as the one before (Prandtl and Ishlinskii's model)."""
+
+    location, form, linear, mixes = "nonlinearity", "memory", False, True
+    besides = (
+        Parameter("shaped_nonlinearity.reach", "m", 0.0, np.inf, "positive"),
+        *(Parameter(f"shaped_nonlinearity.play{j}", "1", scale=1e-2) for j in (1, 2, 3)),
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        reaches = (q * known.flame_input_amplitude for q in (0.02, 0.1, 0.5))
+        return [(reach, 0.3, 0.3, 0.3) for reach in reaches]
+
+    def neutral(self) -> None:
+        return None
+
+    def operator(self, p: Values) -> Characteristic:
+        reach, *shares = (p[q.name] for q in self.besides)
+
+        def remembered(w: Any) -> Any:
+            total = w
+            for j, share in enumerate(shares):
+                total = total + (play(w, reach * 0.5**j) - w) * share
+            return total
+
+        return remembered
+
+
 class ShapedExperiment(Shaped):
     """Frequencies, damping, flame and speaker gain that change with time, quadratically."""
 
@@ -223,4 +262,35 @@ PIECES: tuple[type[Shaped], ...] = (
     ShapedSensor,
     ModalSensor,
     ShapedExperiment,
+)
+
+#: What is asked where none of them explains the data: a fit of it takes longer.
+REMEMBERING: tuple[type[Shaped], ...] = (ShapedMemory,)
+
+#: What may differ from run to run by chance at each place: a factor on all that passes there, of
+#: which the phase is a shift in time, of the record as good as of the drive; and the tube's
+#: frequencies and damping.
+CHANCES: tuple[Scatter, ...] = (
+    Scatter(
+        "chance_actuator",
+        "actuator",
+        "",
+        (("gain_rms", "1", DriveGain()), ("phase_rms_rad", "rad", DrivePhase())),
+    ),
+    Scatter(
+        "chance_sensor",
+        "sensor",
+        "",
+        (("gain_rms", "1", SensorGain()), ("phase_rms_rad", "rad", DrivePhase())),
+    ),
+    Scatter("chance_flame", "flame", "", (("gain_rms", "1", Change("flame_gain", 1e-2)),)),
+    Scatter(
+        "chance_experiment",
+        "experiment",
+        "",
+        (
+            ("frequency_rms", "1", Change("frequency", 1e-3)),
+            ("damping_rms", "1", Change("damping", 1e-2)),
+        ),
+    ),
 )

@@ -20,7 +20,7 @@
    loop it lies (`places`).
 """
 
-from identify.trace.places import shaped, whereabouts
+from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
 from identify.trace.selection import (
     Cancelled,
@@ -57,11 +57,13 @@ __all__ = [
     "best_by_name",
     "best_form",
     "candidate",
+    "deviating",
     "family_p",
     "foremost",
     "other_forms",
     "outdone",
     "refitted",
+    "remembering",
     "rivals",
     "score_tests",
     "search",

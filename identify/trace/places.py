@@ -4,7 +4,8 @@ A freely shaped piece (`identify.effects.shaped`) is put at each place of the lo
 fitted like an effect, from the declared fit and from what the best effects make of the declared
 model. The place whose piece takes up most of the misfit, clearly more than any other, is where it
 lies; a place whose piece takes up little is where it is not. A known effect that leaves less than
-the piece of its place speaks for that place: not every law is as smooth as the pieces are.
+the piece of its place speaks for that place: not every law is as smooth as the pieces are. Where no
+piece explains the data, a memory is asked, and chance: runs that each deviate by themselves.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,14 +13,22 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from identify.dataset import Dataset
-from identify.effects.shaped import PIECES
+from identify.effects.shaped import CHANCES, PIECES, REMEMBERING, Shaped
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.results import Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
 from identify.structure import Effect, Structure
 from identify.trace.contests import joins, part_of
-from identify.trace.stages import ROUGH, known_sizes, renamed, shares_of, try_effects, usable
+from identify.trace.stages import (
+    ROUGH,
+    known_sizes,
+    renamed,
+    shares_of,
+    try_effects,
+    try_scatters,
+    usable,
+)
 from identify.trace.tried import EVIDENCE, Tried, best_by_name, first_of_each, misfit
 from identify.trace.tried import tried as as_tried
 
@@ -58,10 +67,11 @@ def shaped(
     tried: Sequence[Tried],
     executor: Executor,
     progress: Callable[[float, str], None],
+    shapes: Sequence[type[Shaped]] = PIECES,
 ) -> list[Tried]:
     """The pieces of each place, started from the declared fit and from what the best of `tried`
     make of the declared model; best first."""
-    every = (piece(data.free_hz, structure.mode_count) for piece in PIECES)
+    every = (piece(data.free_hz, structure.mode_count) for piece in shapes)
     differing = first_of_each(every, lambda p: p.parameters)  # of one mode two are the same
     pieces = [p for p in differing.values() if usable(p, data, structure)]
     best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]
@@ -72,6 +82,33 @@ def shaped(
         if fit is not None and np.isfinite(fit.chi2):
             found.append(as_tried(fit.structure.effects, fit, data))
     return sorted(found, key=misfit)
+
+
+def remembering(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    executor: Executor,
+    progress: Callable[[float, str], None],
+) -> list[Tried]:
+    """A memory, which takes longer: for where none of `shaped` explains the data. From the declared
+    fit alone: what stands for a memory, no other place's law comes near."""
+    return shaped(structure, data, base, (), executor, progress, REMEMBERING)
+
+
+def deviating(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    executor: Executor,
+    rivalled: Tried | None = None,
+) -> list[Tried]:
+    """Runs that each deviate by themselves, at each place where they may; as rivals of what
+    explains the data, from where that has ended and no less likely."""
+    if rivalled is None:
+        return try_scatters(structure, data, base, CHANCES, executor)
+    begun = part_of(rivalled, (), data)  # as loud as `rivalled`: not sought from afar
+    return try_scatters(structure, data, begun, CHANCES, executor, rivalled.evidence)
 
 
 def within_a_place(
@@ -113,15 +150,32 @@ def within_a_place(
 
 
 def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> Whereabouts:
-    """Where a misfit lies, from what the pieces (`shaped`) and single effects among `tries` leave
-    of that of the fit `base`."""
-    single = [t for t in tries if len(t.effects) == 1 and t.spread is None and t.plausible]
-    places = first_of_each(sorted([*pieces, *single], key=misfit), _place)
+    """Where a misfit lies, from what the pieces (`shaped`, `remembering`, `deviating`) and single
+    effects among `tries` leave of that of the fit `base`."""
+    every = [*pieces, *(t for t in tries if len(t.effects) == 1 and t.plausible)]
+    laws = sorted((t for t in every if t.spread is None), key=misfit)
+    places = first_of_each(laws, _place)
     left = {place: t.fit.chi2_per_dof for place, t in places.items()}
+    deviations = _deviations([t for t in every if t.spread is not None], laws)
+    if deviations:
+        own = {place: t.fit.chi2_per_dof for place, t in deviations.items()}
+        left = own | {place: other for place, other in left.items() if place not in own}
+        return Whereabouts(tuple(own), left, base.chi2_per_dof, from_run_to_run=True)
     likely = _likely(list(places.values()), base.chi2_per_dof)
     if pieces and likely and not places[likely[0]].adequate:  # no shape there says nothing of it
         likely += tuple(dict.fromkeys(p.location for p in PIECES if p.location not in left))
     return Whereabouts(likely, left, base.chi2_per_dof)
+
+
+def _deviations(spreads: Sequence[Tried], laws: Sequence[Tried]) -> dict[str, Tried]:
+    """The spreads that explain what no law does, by place: the likeliest, and any that is about as
+    likely. By likelihood, as what a spread leaves is noise by its nature; whether they look random
+    says nothing of the place."""
+    good = sorted((t for t in spreads if t.adequate and t.leaves_noise), key=lambda t: t.evidence)
+    least = min((t.evidence for t in laws), default=np.inf)
+    if not good or any(t.adequate for t in laws) or good[0].evidence > least - EVIDENCE:
+        return {}
+    return first_of_each((t for t in good if t.evidence < good[0].evidence + EVIDENCE), _place)
 
 
 def _shape(item: tuple[Structure, Dataset, Effect, Sequence[Fit]]) -> Fit | None:

@@ -11,7 +11,6 @@ from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits, soften
-from identify.scatter import Spread, fit_scatter
 from identify.start import fit_from_data
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
@@ -33,7 +32,13 @@ from identify.trace.contests import (
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
 from identify.trace.scores import ScoreTest, score_tests
-from identify.trace.stages import as_declared, started_again, try_effects, usable
+from identify.trace.stages import (
+    as_declared,
+    started_again,
+    try_effects,
+    try_scatters,
+    usable,
+)
 from identify.trace.tried import (
     BEATEN,
     EVIDENCE,
@@ -568,29 +573,6 @@ def _beside_the_same_chance(
         if t.explains:
             out += try_scatters(t.fit.structure, data, t.fit, [chance], run)
     return [*out, *_without_chance(out, data)]
-
-
-def try_scatters(
-    structure: Structure,
-    data: Dataset,
-    base: Fit,
-    scatters: Sequence[Scatter],
-    run: Executor,
-    most: float = np.inf,
-) -> list[Tried]:
-    """Each kind of random difference from run to run on top of `structure`, but for those whose
-    evidence (χ² + p ln n) is surely beyond `most`."""
-    left = most - base.theta.size * float(np.log(data.residuals))  # of χ² and penalty
-    spreads = run.map(_scattered, [(structure, data, base, s, left) for s in scatters])
-    return [
-        replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
-        for s, spread in zip(scatters, spreads, strict=True)
-        if spread is not None
-    ]
-
-
-def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float]) -> Spread | None:
-    return fit_scatter(*item)
 
 
 def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:

@@ -18,6 +18,7 @@ from identify.dataset import Dataset
 from identify.effects.scatter import Scatter
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
+from identify.scatter import Spread, fit_scatter
 from identify.start import (
     CoarseStart,
     candidates,
@@ -480,6 +481,29 @@ def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float,
         if ratio not in out:
             out.append(ratio)
     return tuple(out[:2])
+
+
+def try_scatters(
+    structure: Structure,
+    data: Dataset,
+    base: Fit,
+    scatters: Sequence[Scatter],
+    run: Executor,
+    most: float = np.inf,
+) -> list[Tried]:
+    """Each kind of random difference from run to run on top of `structure`, but for those whose
+    evidence (χ² + p ln n) is surely beyond `most`."""
+    left = most - base.theta.size * float(np.log(data.residuals))  # of χ² and penalty
+    spreads = run.map(_scattered, [(structure, data, base, s, left) for s in scatters])
+    return [
+        replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
+        for s, spread in zip(scatters, spreads, strict=True)
+        if spread is not None
+    ]
+
+
+def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float]) -> Spread | None:
+    return fit_scatter(*item)
 
 
 def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:

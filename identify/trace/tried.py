@@ -324,8 +324,10 @@ def _predicts_worse(t: Tried, o: Tried) -> bool:
 
 def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
     """Whether a freely shaped piece is far likelier, complexity counted: then the cause is one that
-    nobody has named, and `t` only comes near to it."""
-    return any(p.adequate and p.evidence < t.evidence - EVIDENCE for p in pieces)
+    nobody has named, and `t` only comes near to it. Chance at one place is asked so of chance at
+    another alone."""
+    good = [p for p in pieces if (p.adequate if p.spread is None else p.explains and t.spread)]
+    return any(p.evidence < t.evidence - EVIDENCE for p in good)
 
 
 def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
