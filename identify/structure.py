@@ -140,12 +140,14 @@ class Preceded:
 class Loss:
     """An amplitude-dependent loss L_i = `coefficients`[i] · g(v), v = Σ `weights`[i] · y_i.
 
-    y_i is mode i's part of the flame's velocity: weights of one make v that velocity.
+    y_i is mode i's part of the flame's velocity: weights of one make v that velocity. `response`
+    filters what g makes, by s: what is in phase with the motion shifts the frequency.
     """
 
     coefficients: Sequence[Any]
     characteristic: Characteristic
     weights: Sequence[Any]
+    response: Callable[[Any], Any] = lambda s: 1.0
 
 
 @dataclass(frozen=True)
@@ -403,10 +405,11 @@ class Structure:
             return Loop(
                 ((H * at_flame,),), (q,), (seen_flame,), seen_drive * drive, (n,), sensor, H
             )
-        lossy = -response(resonators, loss.coefficients)
+        lost = [c * loss.response(s) for c in loss.coefficients]
+        lossy = -response(resonators, lost)
         felt = [b * w for b, w in zip(resonators, loss.weights, strict=True)]
-        seen_lossy = lossy if seen is resonators else -response(seen, loss.coefficients)
-        row = (response(felt, by_flame) * s * on, -response(felt, loss.coefficients))
+        seen_lossy = lossy if seen is resonators else -response(seen, lost)
+        row = (response(felt, by_flame) * s * on, -response(felt, lost))
         q_loss = response(felt, by_drive) * drive
         return Loop(
             ((H * at_flame, H * lossy), row),

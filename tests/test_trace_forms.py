@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+import identify
 from daq.importers import open_campaign
 from identify import dual, start, trace
 from identify.effects import CATALOGUE, by_key
@@ -26,6 +27,7 @@ from identify.trace.tried import BEATEN
 from simulated_rig import build_config
 from simulated_rig.campaigns import (
     PlannedRun,
+    RecordedRun,
     simulate_campaign,
     simulate_run,
     write_campaign,
@@ -34,7 +36,15 @@ from simulated_rig.config import RigConfig
 from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.test_identify_balance import forced_conditions
-from tests.trace_material import fitted, only, record, search_for, thesis_campaign, tried_as
+from tests.trace_material import (
+    altered_campaign,
+    fitted,
+    only,
+    record,
+    search_for,
+    thesis_campaign,
+    tried_as,
+)
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -129,6 +139,40 @@ def test_a_spread_must_leave_nothing_but_noise(
         (found,) = try_scatters(ready.structure, ready.data, base, [drive], InProcess())
         assert found.adequate
         assert found.explains is explains
+
+
+def test_a_drive_picked_up_in_a_channel(tmp_path: Path) -> None:
+    """Without this candidate, one more mode and another place of the sensor were claimed."""
+
+    def picked_up(run: RecordedRun) -> RecordedRun:
+        return replace(run, p2=run.p2 + 0.4 * run.drive)
+
+    ready = altered_campaign(tmp_path, 7, picked_up)
+    found = identify.diagnose(ready.campaign)
+    assert (found.verdict, [e.effect for e in found.effects]) == ("traced", ["drive_pickup"])
+    assert found.effects[0].form == "pressure"
+    pickup = found.effects[0].parameters["drive_pickup.pickup"]
+    assert abs(pickup.value - 0.4) < 4 * pickup.stderr < 0.1
+
+
+def test_a_voice_coil_that_warms(tmp_path: Path) -> None:
+    """The speaker is given V/(1 + hV²) of the recorded V, and no harmonics."""
+    h = 0.02
+
+    def warmed(run: RecordedRun) -> RecordedRun:
+        given = np.max(np.abs(run.drive))
+        recorded = (1 - np.sqrt(1 - 4 * h * given**2)) / (2 * h * given) if given > 1e-3 else given
+        return replace(run, drive=run.drive * (recorded / given if given > 0 else 1.0))
+
+    ready = altered_campaign(tmp_path, 7, warmed)
+    found = identify.diagnose(ready.campaign)
+    assert (found.verdict, [e.effect for e in found.effects]) == (
+        "traced",
+        ["actuator_nonlinearity"],
+    )
+    assert found.effects[0].form == "power_compression"
+    size = found.effects[0].parameters["actuator_nonlinearity.per_power"]
+    assert abs(size.value - h) < 4 * size.stderr < 0.1 * h
 
 
 def test_two_further_modes(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Campaigns of the simulated rig with effects in it, and short ways to search them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from identify.load import load_campaign
 from identify.record import Campaign
 from identify.structure import Structure
 from simulated_rig import build_config
-from simulated_rig.campaigns import simulate_campaign, write_campaign
+from simulated_rig.campaigns import RecordedRun, simulate_campaign, write_campaign
 from simulated_rig.config import RigConfig
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
@@ -84,6 +84,19 @@ def thesis_campaign(
     made = [make_effect(key, parameters) for key, parameters in pairs]
     rig = build_config(preset, noise_db=noise_db)
     return record(folder, seed, rig, made, forced=7, validation=validation)
+
+
+def altered_campaign(
+    folder: Path, seed: int, change: Callable[[RecordedRun], RecordedRun]
+) -> Prepared:
+    """The thesis's rig, two modes declared, each of its recordings changed; of 24 bits, so that no
+    change is lost between two counts."""
+    rig = build_config(noise_db=36.0)
+    rig = replace(rig, converter=replace(rig.converter, bits=24))
+    rig, plan = random_campaign(seed, rig, [], forced=7, validation=2)
+    made = simulate_campaign(rig, plan, seed, declared_modes=2)
+    write_campaign(replace(made, runs=tuple(map(change, made.runs))), folder)
+    return prepare(load_campaign(open_campaign(folder)))
 
 
 def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tried]]:

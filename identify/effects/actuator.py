@@ -146,6 +146,27 @@ class Distortion(Effect):
         return total
 
 
+class PowerCompression(Effect):
+    """A voice coil that warms: a gain of 1/(1 + hU²), U the amplitude of the drive's fundamental.
+
+    It follows the power of many periods, and so makes no harmonics.
+    """
+
+    name, location, form = "actuator_nonlinearity", "actuator", "power_compression"
+    parameters = (Parameter("actuator_nonlinearity.per_power", "V^-2", scale=1e-2),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q / known.drive_amplitude**2,) for q in (0.02, 0.2)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        first = u[:, :1]
+        power = (first * dual.conj(first)).real
+        return u / (power * p["actuator_nonlinearity.per_power"] + 1.0)
+
+
 class Clipping(Effect):
     """The amplifier saturates: L tanh(u/L)."""
 
@@ -251,6 +272,7 @@ EFFECTS: tuple[Effect, ...] = (
     Distortion((3,)),
     Distortion((2, 3)),
     Distortion((3, 5)),
+    PowerCompression(),
     Clipping(),
     HardClipping(),
     Crossover(),

@@ -205,6 +205,38 @@ class SensorCoupling(Effect):
         return y * (s / (2 * np.pi * p["sensor_dynamics.corner_hz"] + s))
 
 
+class DrivePickup(Effect):
+    """The drive's voltage is picked up in the recorded channels: crosstalk of cables, converters.
+
+    ``pressure``: Pa/V more of it in the upper microphone's channel than in the lower's, which the
+    two-microphone method takes for a velocity, −U/(ρ Δx s); ``velocity``: m/s/V in a channel that
+    is a velocity.
+    """
+
+    name, location = "drive_pickup", "sensor"
+
+    def __init__(self, form: str) -> None:
+        self.form = form
+        self.needs = ("pressure",) if form == "pressure" else ()
+        unit, scale = ("Pa/V", 1e-1) if form == "pressure" else ("m/s/V", 1e-4)
+        self.parameters = (Parameter("drive_pickup.pickup", unit, scale=scale),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        size = 0.01 * known.velocity_amplitude / known.drive_amplitude
+        if self.form == "pressure":
+            size *= 0.4 * known.free_hz  # ρ Δx ω, of microphones 5 cm apart
+        return [(size,), (-size,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        heard: Any = at.drive
+        if self.form == "pressure":
+            heard = -heard / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+        return y + heard * p["drive_pickup.pickup"]
+
+
 EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("gain"),
     ChannelMismatch("skew"),
@@ -222,4 +254,6 @@ EFFECTS: tuple[Effect, ...] = (
     ModalOffset(4),
     SensorLag(),
     SensorCoupling(),
+    DrivePickup("pressure"),
+    DrivePickup("velocity"),
 )

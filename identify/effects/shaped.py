@@ -26,6 +26,7 @@ from identify.structure import (
     Conditions,
     Effect,
     Known,
+    Loss,
     Mode,
     Structure,
     Values,
@@ -147,18 +148,25 @@ class ModalSensor(ShapedSensor):
 
 
 class ShapedForward(Shaped):
-    """Any smooth linear response common to flame and speaker, one more mode, and a loss that grows.
+    """Any smooth linear response common to flame and speaker, one more mode, and a loss that grows,
+    or a frequency: a share of it acts a quarter period earlier or later.
 
     A factor on the acoustics changes the velocity that is measured and that the flame feels.
     """
 
     location = "forward"
-    besides = (*MODE.parameters, *LOSS.parameters)
-    loss = LOSS.loss
+    besides = (
+        *MODE.parameters,
+        *LOSS.parameters,
+        Parameter("shaped_forward.reactance", "1", scale=1e-1),
+    )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        rows = MODE.starts(known)
-        return [(*h, *row, *LOSS.neutral()) for h in self.responses() for row in rows]
+        rows, none = MODE.starts(known), (*LOSS.neutral(), 0.0)
+        small = [0.1 * size for size in LOSS.starts(known)[0]]
+        reactive = [((0.0,) * STEPS, (*small, sign)) for sign in (3.0, -3.0)]
+        kinds = [*((h, none) for h in self.responses()), *reactive]
+        return [(*h, *row, *loss) for h, loss in kinds for row in rows]
 
     def neutral(self) -> None:
         return None
@@ -168,7 +176,7 @@ class ShapedForward(Shaped):
 
     def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
         found, at = MODE.from_restated(structure, values), -len(MODE.parameters)
-        return [*found[:at], *(0.0,) * STEPS, *found[at:], *LOSS.neutral()]
+        return [*found[:at], *(0.0,) * STEPS, *found[at:], *LOSS.neutral(), 0.0]
 
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         return self.response(p, s)
@@ -178,6 +186,11 @@ class ShapedForward(Shaped):
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         return MODE.modes(p, at, modes)
+
+    def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss:
+        reactance = p["shaped_forward.reactance"]
+        whole = LOSS.loss(p, at, modes)
+        return replace(whole, response=lambda s: self.step(s) * reactance + 1.0)
 
 
 class ShapedNonlinearity(Shaped):

@@ -15,9 +15,9 @@
 4. What explains the data must also predict the validation runs, lie in its plausible range, take
    most of the misfit away by more than chance, and have no rival: another effect that does as
    well, complexity counted (`tried`), nor, where it leaves more than noise mostly does, a freely
-   shaped piece that is far likelier.
+   shaped piece that is far likelier; a spread, no spread at another place.
 5. Where nothing explains the data, freely shaped pieces and the single effects say where in the
-   loop it lies (`places`).
+   loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`).
 """
 
 from identify.trace.places import deviating, remembering, shaped, whereabouts
