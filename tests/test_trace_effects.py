@@ -15,6 +15,8 @@ from identify.effects.scatter import SCATTERS
 from identify.effects.shaped import (
     LAGS,
     Shaped,
+    ShapedActuator,
+    ShapedExperiment,
     ShapedFlame,
     ShapedForward,
     ShapedNonlinearity,
@@ -602,7 +604,8 @@ def test_runs_that_deviate_are_placed(
     ready = thesis_campaign(tmp_path, 7, {key: parameters})
     base = start.fit_from_data(ready.structure, ready.data)
     run = InProcess()
-    laws = shaped(ready.structure, ready.data, base, [], run, lambda share, text: None)
+    some = (ShapedActuator, ShapedExperiment)
+    laws = shaped(ready.structure, ready.data, base, [], run, lambda share, text: None, some)
     assert not any(t.adequate for t in laws)
     deviations = deviating(ready.structure, ready.data, base, run)
     found = whereabouts([*laws, *deviations], [], base)
