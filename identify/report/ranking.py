@@ -47,8 +47,11 @@ def ranking(d: Diagnosis) -> Figure:
 
 @theme.styled
 def places(found: Whereabouts) -> Figure:
-    """χ² per degree of freedom that a free shape or one known effect leaves at each place."""
-    names = ["declared model", *(PLACES[p] for p in found.left)]
+    """χ² per degree of freedom that a free shape, one known effect or, where no law takes it up,
+    runs that each deviate leave at each place."""
+    deviating = found.likely if found.from_run_to_run else ()
+    own = {p: f"{PLACES[p]}, run by run" if p in deviating else PLACES[p] for p in found.left}
+    names = ["declared model", *own.values()]
     chi2 = np.array([found.before, *found.left.values()])
     likely = [theme.AFTER if p in found.likely else theme.NOISE for p in found.left]
     margins = theme.Margins(left=0.3 + 0.062 * max(len(n) for n in names))
