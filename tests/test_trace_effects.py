@@ -574,7 +574,8 @@ def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
     ready = thesis_campaign(tmp_path, 7, {"nonlinearity_shape": {"hysteresis_width": 0.0063}})
     base = start.fit_from_data(ready.structure, ready.data)
     run, silent = InProcess(), lambda share, text: None
-    pieces = shaped(ready.structure, ready.data, base, [], run, silent)
+    some = (ShapedExperiment, ShapedActuator, ShapedNonlinearity)
+    pieces = shaped(ready.structure, ready.data, base, [], run, silent, some)
     assert whereabouts(pieces, [], base).likely != ("nonlinearity",)
     memory = remembering(ready.structure, ready.data, base, run, silent)
     assert [t.adequate for t in memory] == [True]
@@ -618,7 +619,7 @@ def test_runs_that_deviate_are_placed(
 
 def test_a_law_that_explains_needs_no_run_to_deviate(tmp_path: Path) -> None:
     """Whatever a spread takes up: a place where a law says it all is where it lies."""
-    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-5}})
     base = start.fit_from_data(ready.structure, ready.data)
     run = InProcess()
     deviations = deviating(ready.structure, ready.data, base, run)

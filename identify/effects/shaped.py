@@ -229,10 +229,12 @@ class ShapedMemory(Shaped):
         reach, *shares = (p[q.name] for q in self.besides)
 
         def remembered(w: Any) -> Any:
-            total = w
-            for j, share in enumerate(shares):
-                total = total + (play(w, reach * 0.5**j) - w) * share
-            return total
+            taken, *others = shares
+            total = play(w, reach) * taken
+            for j, share in enumerate(others, start=1):
+                total = total + play(w, reach * 0.5**j) * share
+                taken = taken + share
+            return total + w * (1.0 - taken)
 
         return remembered
 
