@@ -137,7 +137,7 @@ def diagnose(
     where = None
     if verdict == "unexplained":
         asked = list(pieces())
-        if not any(t.adequate for t in asked):
+        if not trace.smooth(asked, base):
             asked += trace.remembering(ready.structure, data, base, run, placing)
             asked += deviating()
         where = trace.whereabouts(asked, tried, base)
