@@ -125,19 +125,20 @@ def diagnose(
         placing(1.0, "trying runs that deviate at each place")
         return trace.deviating(ready.structure, data, base, run, rivalled)
 
+    contesting: list[Tried] = []
     verdict, chosen, explanation = _judge(declared, tried, data)
     if chosen is not None and (chosen.fit_p < DOUBTFUL or chosen.spread or len(chosen.effects) > 1):
         # a spread takes up much, and so may laws: not where one does better that nobody knows
         tried = trace.against_chance(tried, pieces())
-        rivals = [*pieces(), *(deviating(chosen) if chosen.spread else ())]
-        verdict, chosen, explanation = _judge(declared, tried, data, rivals)
+        contesting = deviating(chosen) if chosen.spread else []
+        verdict, chosen, explanation = _judge(declared, tried, data, [*pieces(), *contesting])
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."
     where = None
     if verdict == "unexplained":
-        asked = list(pieces())
-        if not trace.smooth(asked, base):
+        asked = [*pieces(), *contesting]
+        if not trace.smooth(pieces(), base):
             asked += trace.remembering(ready.structure, data, base, run, placing)
             asked += deviating()
         where = trace.whereabouts(asked, tried, base)
