@@ -20,7 +20,7 @@
    loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`).
 """
 
-from identify.trace.places import deviating, remembering, shaped, smooth, whereabouts
+from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
 from identify.trace.selection import (
     Cancelled,
@@ -68,7 +68,6 @@ __all__ = [
     "score_tests",
     "search",
     "shaped",
-    "smooth",
     "started_again",
     "try_effects",
     "usable",

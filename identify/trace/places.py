@@ -35,7 +35,6 @@ from identify.trace.tried import tried as as_tried
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave …
 LITTLE = 0.6  # … and any that is not ruled out
-SMOOTHLY = 0.02  # the same where a smooth shape leaves no room for a memory, or runs that deviate
 STARTS, AFAR = 3, 4  # that are led on, of each kind; that are looked at from afar
 PLACES, PARENTS = 2, 2  # of which two effects are sought together, and from how many first ones
 
@@ -83,12 +82,6 @@ def shaped(
         if fit is not None and np.isfinite(fit.chi2):
             found.append(as_tried(fit.structure.effects, fit, data))
     return sorted(found, key=misfit)
-
-
-def smooth(pieces: Sequence[Tried], base: Fit) -> bool:
-    """Whether a smooth shape takes up all of a misfit, or nearly: then nothing else is asked."""
-    excess = SMOOTHLY * (base.chi2_per_dof - 1.0)
-    return any(t.adequate or t.fit.chi2_per_dof - 1.0 < excess for t in pieces)
 
 
 def remembering(
