@@ -138,7 +138,7 @@ def diagnose(
     where = None
     if verdict == "unexplained":
         asked = [*pieces(), *contesting]
-        if not any(t.adequate for t in pieces()):
+        if not any(t.adequate and t.fit_p > DOUBTFUL for t in pieces()):
             asked += trace.remembering(ready.structure, data, base, run, placing)
             asked += deviating()
         where = trace.whereabouts(asked, tried, base)
