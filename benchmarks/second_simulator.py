@@ -286,12 +286,15 @@ def _resonance(hz: float, zeta: float) -> Callable[[complex], complex]:
     return lambda s: w * w / (s * s + 2 * zeta * w * s + w * w)
 
 
-def _course(name: str, change: float, first: bool = False, settles: float = 0.0) -> Any:
-    """A relative change of one of the tube's numbers (of all modes, or the first), linear or
-    settling exponentially."""
+def _course(
+    name: str, change: float, first: bool = False, settles: float = 0.0, after: float = 0.0
+) -> Any:
+    """A relative change of one of the tube's numbers (of all modes, or the first), linear, settling
+    exponentially, or at once `after` a share of the campaign."""
 
     def now(tube: Tube, t: float) -> Tube:
-        factor = 1 + change * ((1 - np.exp(-t / settles)) if settles else t)
+        part = float(t > after) if after else (1 - np.exp(-t / settles)) if settles else t
+        factor = 1 + change * part
         value = getattr(tube, name)
         if isinstance(value, float):
             value *= factor
@@ -378,19 +381,6 @@ PAIRS = (
 )
 
 
-def _step(name: str, change: float, when: float) -> Any:
-    """One of the tube's numbers, from a share of the campaign on another."""
-
-    def now(tube: Tube, t: float) -> Tube:
-        value = getattr(tube, name)
-        factor = 1 + change * (t > when)
-        other = value * factor if isinstance(value, float) else tuple(x * factor for x in value)
-        moved: dict[str, Any] = {name: other}
-        return replace(tube, **moved)
-
-    return now
-
-
 def _bends(size: float) -> Callable[[FloatArray], FloatArray]:
     """A microphone that compresses by that share at its largest."""
     return lambda p: p * (1 - size * (p / np.max(np.abs(p))) ** 2)
@@ -405,8 +395,8 @@ STRANGERS: dict[str, dict[str, Any]] = {
     "sensor/crosstalk of the drive": {"crosstalk": 0.5},
     "sensor/one microphone compresses": {"microphones": (lambda p: p, _bends(0.003))},
     "sensor/both microphones compress": {"microphones": (_bends(0.01), _bends(0.01))},
-    "experiment/frequency steps": {"drift": _step("frequency_hz", 0.002, 0.45)},
-    "experiment/flame steps": {"drift": _step("flame_gain", 0.02, 0.6)},
+    "experiment/frequency steps": {"drift": _course("frequency_hz", 0.002, after=0.45)},
+    "experiment/flame steps": {"drift": _course("flame_gain", 0.02, after=0.6)},
 }
 
 

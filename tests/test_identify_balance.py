@@ -1,5 +1,6 @@
 """Harmonic balance against the thesis's numbers, and its derivatives against differences."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from identify.dual import Dual
 from identify.effects import by_key
 from identify.effects.shaped import ShapedMemory
 from identify.polynomial import Polynomial
-from identify.structure import Characteristic, Conditions, Loop, Structure, declared_modes
+from identify.structure import Characteristic, Conditions, Effect, Loop, Structure, declared_modes
 from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
 
 K = 7
@@ -96,14 +97,10 @@ def test_derivatives_agree_with_differences(free: bool) -> None:
         assert error < 2e-4 * size, structure.parameters.names[j]
 
 
-@pytest.mark.parametrize("form", ["dead_zone", "hysteresis", "tanh"])
-def test_slopes_of_what_is_sampled_agree_with_differences(form: str) -> None:
-    """Corners, and a play that holds its output for half of each period."""
-    effect = by_key(f"nonlinearity_shape:{form}")
+def assert_slopes_agree_with_differences(effect: Effect, own: Sequence[float]) -> None:
     rng = np.random.default_rng(3)
     v = rng.normal(size=(2, K)) * 3000 / np.arange(1, K + 1) + 1j * rng.normal(size=(2, K)) * 300
-    size = 1 / 4000 if form == "tanh" else 800.0
-    values = {**true_values(), effect.parameters[0].name: size}
+    values = {**true_values(), **dict(zip((q.name for q in effect.parameters), own, strict=True))}
     (n,) = Structure(effects=(effect,)).characteristics(values, forced_conditions())
     exact = balance._force_jacobian(n, v, K)
     for j in range(2 * K):
@@ -114,20 +111,16 @@ def test_slopes_of_what_is_sampled_agree_with_differences(form: str) -> None:
         np.testing.assert_allclose((up - down) / 2e-4, exact[:, :, j], atol=2e-6)
 
 
+@pytest.mark.parametrize("form", ["dead_zone", "hysteresis", "tanh"])
+def test_slopes_of_what_is_sampled_agree_with_differences(form: str) -> None:
+    """Corners, and a play that holds its output for half of each period."""
+    size = 1 / 4000 if form == "tanh" else 800.0
+    assert_slopes_agree_with_differences(by_key(f"nonlinearity_shape:{form}"), [size])
+
+
 def test_slopes_of_a_memory_of_several_plays_agree_with_differences() -> None:
     """At each moment its output follows the input of several."""
-    effect = ShapedMemory(FREE_HZ, 2)
-    rng = np.random.default_rng(3)
-    v = rng.normal(size=(2, K)) * 3000 / np.arange(1, K + 1) + 1j * rng.normal(size=(2, K)) * 300
-    own = dict(zip((q.name for q in effect.parameters), (800.0, 0.5, -0.7, 0.9), strict=True))
-    structure = Structure(effects=(effect,))
-    (n,) = structure.characteristics({**true_values(), **own}, forced_conditions())
-    exact = balance._force_jacobian(n, v, K)
-    for j in range(2 * K):
-        h = np.zeros(K, dtype=complex)
-        h[j % K] = 1e-4 if j < K else 1e-4j
-        up, down = balance._force(n, v + h, K), balance._force(n, v - h, K)
-        np.testing.assert_allclose((up - down) / 2e-4, exact[:, :, j], atol=2e-6)
+    assert_slopes_agree_with_differences(ShapedMemory(FREE_HZ, 2), [800.0, 0.5, -0.7, 0.9])
 
 
 def test_several_vectors_at_once_equal_one_by_one() -> None:

@@ -64,10 +64,13 @@ def record(
     forced: int,
     validation: int,
     modes: int = 2,
+    change: Callable[[RecordedRun], RecordedRun] = lambda run: run,
 ) -> Prepared:
-    """A random campaign on a rig with these effects, so many modes declared, written and read."""
+    """A random campaign on a rig with these effects, so many modes declared, each recording
+    changed, written and read."""
     rig, plan = random_campaign(seed, rig, effects, forced=forced, validation=validation)
-    write_campaign(simulate_campaign(rig, plan, seed, declared_modes=modes), folder)
+    made = simulate_campaign(rig, plan, seed, declared_modes=modes)
+    write_campaign(replace(made, runs=tuple(map(change, made.runs))), folder)
     return prepare(load_campaign(open_campaign(folder)))
 
 
@@ -93,10 +96,7 @@ def altered_campaign(
     change is lost between two counts."""
     rig = build_config(noise_db=36.0)
     rig = replace(rig, converter=replace(rig.converter, bits=24))
-    rig, plan = random_campaign(seed, rig, [], forced=7, validation=2)
-    made = simulate_campaign(rig, plan, seed, declared_modes=2)
-    write_campaign(replace(made, runs=tuple(map(change, made.runs))), folder)
-    return prepare(load_campaign(open_campaign(folder)))
+    return record(folder, seed, rig, [], forced=7, validation=2, change=change)
 
 
 def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tried]]:

@@ -20,6 +20,11 @@ def upper_pressure(at: Conditions, s: Any) -> Any:
     return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
 
 
+def as_velocity(at: Conditions, s: Any, pressure: Any) -> Any:
+    """p/(ρ Δx s): what the two-microphone method takes p less at the upper microphone for."""
+    return pressure / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+
+
 def with_leak(at: Conditions, y: Any, leak: Any) -> Any:
     """Prediction plus a leak formed from measured signals, in the measurement's phase.
 
@@ -93,7 +98,7 @@ class ChannelMismatch(Effect):
                 inverse = inverse * (2 * np.pi * value / s + 1.0)
             else:
                 inverse = inverse * (s * value + 1.0)
-        leak = upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+        leak = as_velocity(at, s, upper_pressure(at, s))
         return with_leak(at, y, leak * (inverse - 1.0))
 
 
@@ -233,7 +238,7 @@ class DrivePickup(Effect):
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
         heard: Any = at.drive
         if self.form == "pressure":
-            heard = -heard / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+            heard = as_velocity(at, s, -heard)
         return y + heard * p["drive_pickup.pickup"]
 
 

@@ -19,7 +19,7 @@ from identify.effects.experiment import course
 from identify.effects.forward import AcousticMode, NonlinearDamping
 from identify.effects.nonlinearity import HigherOrder, play
 from identify.effects.scatter import Change, DriveGain, DrivePhase, Scatter, SensorGain
-from identify.effects.sensor import upper_pressure, with_leak
+from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
 from identify.structure import (
     Characteristic,
@@ -126,7 +126,7 @@ class ShapedSensor(Shaped):
 
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
         step = self.step(s)
-        leak = upper_pressure(at, s) / (s * (at.density_kg_m3 * at.spacing_m[:, None]))
+        leak = as_velocity(at, s, upper_pressure(at, s))
         shares: Sequence[Any] = [p[q.name] for q in self.besides]
         passed = shares[0] + step * shares[1] + step * step * shares[2]
         return with_leak(at, y * self.response(p, s), leak * passed)
@@ -278,9 +278,6 @@ PIECES: tuple[type[Shaped], ...] = (
     ModalSensor,
     ShapedExperiment,
 )
-
-#: What is asked where none of them explains the data: a fit of it takes longer.
-REMEMBERING: tuple[type[Shaped], ...] = (ShapedMemory,)
 
 #: What may differ from run to run by chance at each place: a factor on all that passes there, of
 #: which the phase is a shift in time, of the record as good as of the drive; and the tube's

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from identify.dataset import Dataset
-from identify.effects.shaped import CHANCES, PIECES, REMEMBERING, Shaped
+from identify.effects.shaped import CHANCES, PIECES, Shaped, ShapedMemory
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.results import Whereabouts
@@ -93,7 +93,7 @@ def remembering(
 ) -> list[Tried]:
     """A memory, which takes longer: for where none of `shaped` explains the data. From the declared
     fit alone: what stands for a memory, no other place's law comes near."""
-    return shaped(structure, data, base, (), executor, progress, REMEMBERING)
+    return shaped(structure, data, base, (), executor, progress, (ShapedMemory,))
 
 
 def deviating(
