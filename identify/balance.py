@@ -42,6 +42,7 @@ IntArray = npt.NDArray[np.int64]
 
 TOLERANCE = 1e-10  # relative Newton residual: far below any noise, above rounding
 MAX_ITERATIONS = 12  # Newton steps; twice as many where ω is an unknown too
+NEAR = 1e-7  # of ω: within that, the terms' first order in ω is exact to far below any noise
 FINE = 1024  # samples a period of a `Preceded` characteristic: turning points to 5e-6 of the swing
 
 
@@ -80,7 +81,8 @@ def to_harmonics(x: Any, harmonics: int, samples: int | None = None) -> Any:
     matrix = _period(harmonics, samples)[1]
     if isinstance(x, Dual):
         d = np.broadcast_to(x.d, (*x.v.shape, x.d.shape[-1]))
-        return Dual(x.v @ matrix.T, np.einsum("kt,rtp->rkp", matrix, d, optimize=True))
+        both = np.concatenate([matrix.real, matrix.imag]) @ d
+        return Dual(x.v @ matrix.T, both[:, :harmonics] + 1j * both[:, harmonics:])
     return x @ matrix.T
 
 
@@ -188,13 +190,22 @@ def _newton(
         while rows.size:
             loop, terms = _assembled(structure, p, at, omega[rows], len(v))
             found = _solved(loop.N, terms, v[:, rows], omega[rows], at.free, left)
+            away = found[1] - omega[rows]
             v[:, rows], omega[rows], error[rows], taken, forces = found
-            predicted[rows] = dual.value(_velocity(loop, forces))
-            again = np.flatnonzero(at.free & (taken > 0))  # the others were solved where assembled
+            predicted[rows] = _moved(_velocity(loop, forces), away)
+            # the others were solved where the terms were assembled, or near enough
+            again = np.flatnonzero(at.free & (taken > 0) & ~(np.abs(away) < NEAR * omega[rows]))
             rows, left, at = rows[again], (left - taken)[again], at.take(again)
             p = {n: x[again] for n, x in p.items()}
     converged = (error < 1e-8) & np.isfinite(predicted).all(axis=1)
     return Orbits(v, predicted, omega, converged)
+
+
+def _moved(x: Any, away: FloatArray) -> ComplexArray:
+    """Values (runs, K) at frequencies so far `away`, to first order, from those with ω as seed."""
+    if not isinstance(x, Dual):
+        return np.asarray(x)
+    return np.asarray(x.v + x.d[..., 0] * away[:, None])
 
 
 def _solved(
@@ -208,7 +219,7 @@ def _solved(
     """Inputs, frequencies, relative residuals, steps taken and N̂ with the terms as they are."""
     if not all(isinstance(n, Polynomial) for n in N):
         return _sampled_newton(N, terms, v, omega, free, left)
-    curves, waves = _tables(N, omega.size), _waves(v.shape[2])
+    curves, waves = _tables(N, omega.size), _waves(v.shape[2], _samples(N, v.shape[2]))
     found = newton(*terms, curves, v, omega, *waves, free, left, TOLERANCE)
     return v, omega, *found
 
@@ -321,22 +332,47 @@ def _velocity(loop: Loop, forces: Iterable[Any]) -> Any:
 
 def slope_along(n: Characteristic, x: FloatArray) -> FloatArray:
     """N′ at time samples, by automatic differentiation with respect to the input."""
+    if isinstance(n, Polynomial):
+        return np.asarray(n.curve(x)[1] + np.zeros_like(x))
     out = n(Dual(x, np.ones((*x.shape, 1))))
     return np.asarray(dual.derivative(out, x.shape, 1)[..., 0], dtype=float)
 
 
-def _force(n: Characteristic, v: Any, K: int) -> Any:
+def _force(n: Characteristic, v: ComplexArray, K: int) -> Any:
     """N̂, the Fourier coefficients of one nonlinearity's output."""
+    curve, samples = (n.curve, FINE) if isinstance(n, Preceded) else (n, _samples([n], K))
+    x, by = to_time(v, K, samples), []
     if isinstance(n, Preceded):
-        return to_harmonics(n.periodic(to_time(v, K, FINE)), K, FINE)
-    return to_harmonics(n(to_time(v, K)), K)
+        passed = n.operator(x)
+        x, by = passed.output, [(d, q) for d, q in passed.by if isinstance(q, Dual)]
+    if not isinstance(curve, Polynomial):
+        return to_harmonics(curve(dual.chain(x, *by)), K, samples)
+    # parameters vary all samples alike: their derivatives go to harmonics before the seeds
+    value, slope = curve.curve(x)
+    terms = [*curve.terms(x), *((slope * d, q) for d, q in by)]
+    parts = [(to_harmonics(partial, K, samples), q) for partial, q in terms]
+    return dual.chain(to_harmonics(value, K, samples), *parts)
+
+
+def _samples(N: Sequence[Characteristic], K: int) -> int | None:
+    """Samples a period that are enough for all of these; None: as many as usual.
+
+    A polynomial makes no harmonics above its degree times K, and its slope none above the degree
+    less one times K: with (degree + 1) K + 1 samples, none of them is taken for one up to K, nor
+    of the slope's for one up to 2K.
+    """
+    smooth = [n for n in N if isinstance(n, Polynomial) and n.bent is None]
+    if len(smooth) < len(N):
+        return None
+    return (max(len(n.coefficients) for n in smooth) + 1) * K + 1
 
 
 def _slopes(N: Sequence[Characteristic], v: ComplexArray) -> Sequence[ComplexArray]:
     """∂N̂/∂x of every nonlinearity, (runs, K, 2K) each."""
     K = v.shape[2]
     if all(isinstance(n, Polynomial) for n in N):
-        return tuple(slopes(_tables(N, v.shape[1]), np.ascontiguousarray(v), *_waves(K)))
+        waves = _waves(K, _samples(N, K))
+        return tuple(slopes(_tables(N, v.shape[1]), np.ascontiguousarray(v), *waves))
     return [_force_jacobian(n, x, K) for n, x in zip(N, v, strict=True)]
 
 
@@ -344,24 +380,14 @@ def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
     """∂N̂/∂x of one nonlinearity, (runs, K, 2K)."""
     if not isinstance(n, Preceded):
         return _from_slope(slope_along(n, to_time(v, K)), K)
-    if n.mixes:
-        seeded = np.broadcast_to(
-            np.concatenate([np.eye(K), 1j * np.eye(K)], axis=1), (*v.shape, 2 * K)
-        )
-        return np.asarray(dual.derivative(_force(n, Dual(v, seeded), K), v.shape, 2 * K))
     x, own = to_time(v, K, FINE), np.arange(FINE)
-    # an output may follow the input of another time: its slope by both seeds says which
-    seeds = np.stack([np.ones(FINE), own], axis=1)
-    by_both = dual.derivative(
-        n.periodic(Dual(x, np.broadcast_to(seeds, (*x.shape, 2)))), x.shape, 2
-    )
-    slope, there = by_both[..., 0], by_both[..., 0] != 0
-    ratio = np.divide(by_both[..., 1], slope, out=np.zeros_like(slope), where=there)
-    followed = np.where(there & np.isfinite(ratio), np.rint(ratio), own).astype(np.int64)
-    moving = followed == own
+    passed = n.operator(x)
+    slope = slope_along(n.curve, passed.output)
+    moving = sum(share * (at == own) for share, at in passed.follows)
     out = _from_slope(slope * moving, K, FINE)
-    if not moving.all():
-        add_held(slope, followed, *_period(K, FINE), out)
+    for share, at in passed.follows:
+        if not np.all(at == own):
+            add_held(slope * share, at, *_period(K, FINE), out)
     return out
 
 

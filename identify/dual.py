@@ -131,7 +131,10 @@ def chain(v: Array, *terms: tuple[Array, Operand]) -> Any:
     for partial, x in terms:
         if isinstance(x, Dual):
             part = partial[..., None] * x.d
-            total = part if total is None else total + part
+            if total is not None and total.shape == part.shape and total.dtype == part.dtype:
+                total += part  # a product of its own: nobody else holds it
+            else:
+                total = part if total is None else total + part
     return v if total is None else Dual(v, total)
 
 

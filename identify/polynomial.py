@@ -48,21 +48,32 @@ class Polynomial:
 
     def __call__(self, w: Any) -> Any:
         x = dual.value(w)
+        value, slope = self.curve(x)
+        return dual.chain(value, (slope + np.zeros_like(x), w), *self.terms(x))
+
+    def terms(self, x: FloatArray) -> list[tuple[FloatArray, Dual]]:
+        """N's partial derivatives at time samples by those coefficients that carry derivatives,
+        with these coefficients."""
+        out: list[tuple[FloatArray, Dual]] = []
+        if isinstance(self.bent, Dual):
+            out.append((x * np.abs(x), self.bent))
+        power = x
+        for c in self.coefficients:
+            if isinstance(c, Dual):
+                out.append((power, c))
+            power = power * x
+        return out
+
+    def curve(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """N and N′ at time samples."""
         total: Any = 0.0  # Horner's scheme from the highest degree down
         slope: Any = 0.0
         for d, c in reversed(list(enumerate(map(dual.value, self.coefficients), start=1))):
             total = total * x + c
             slope = slope * x + d * c
         value = total * x
-        terms: list[tuple[Any, Any]] = []
         if self.bent is not None:
             size = np.abs(x)
             value = value + dual.value(self.bent) * x * size
             slope = slope + 2.0 * dual.value(self.bent) * size
-            terms.append((x * size, self.bent))
-        power = x
-        for c in self.coefficients:
-            if isinstance(c, Dual):
-                terms.append((power, c))
-            power = power * x
-        return dual.chain(value, (slope + np.zeros_like(x), w), *terms)
+        return value, slope

@@ -30,6 +30,7 @@ from identify.polynomial import Polynomial
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 Values = Mapping[str, Any]  # physical parameter values by name: floats or Duals
 Characteristic = Callable[[Any], Any]  # static function of time samples, shape (runs, samples)
 NONLINEARITIES = ("polynomial", "saturation", "lagrange", "linear")
@@ -116,24 +117,35 @@ class Mode:
 
 
 @dataclass(frozen=True)
+class Passed:
+    """What an operator makes of one period of time samples: its output, (runs, samples).
+
+    `follows`: whose inputs the output follows, as pairs of its slope by an input, (runs, samples),
+    and the sample of that input, (runs, samples); `by`: its partial derivatives by parameters,
+    (runs, samples), with these.
+    """
+
+    output: FloatArray
+    follows: Sequence[tuple[FloatArray, IntArray]]
+    by: Sequence[tuple[FloatArray, Any]]
+
+
+Operator = Callable[[FloatArray], Passed]  # of time samples, (runs, samples)
+
+
+@dataclass(frozen=True)
 class Preceded:
     """A characteristic with an operator before it that has corners or remembers, and so needs
     whole periods, finely sampled.
 
-    Called like any other it is the curve alone (small signals, plots of N). `mixes`: whether the
-    operator's output follows the input of several times at once.
+    Called like any other it is the curve alone (small signals, plots of N).
     """
 
     curve: Characteristic
-    operator: Characteristic
-    mixes: bool = False
+    operator: Operator
 
     def __call__(self, w: Any) -> Any:
         return self.curve(w)
-
-    def periodic(self, w: Any) -> Any:
-        """The output over one period, (runs, samples)."""
-        return self.curve(self.operator(w))
 
 
 @dataclass(frozen=True)
@@ -178,7 +190,6 @@ class Effect:
     located: tuple[str, ...] = ()  # parameters known to within their size, or it is not seen at all
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
-    mixes: bool = False  # its `operator`'s output follows the input of several times at once
 
     def starts(self, known: "Known") -> list[tuple[float, ...]]:
         raise NotImplementedError(f"effect {self.name!r} proposes no starting values")
@@ -230,9 +241,9 @@ class Effect:
     def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
         return n
 
-    def operator(self, p: Values) -> Characteristic | None:
+    def operator(self, p: Values) -> Operator | None:
         """What acts on the flame's input before the characteristic and has corners or remembers:
-        it takes one period of time samples, (runs, samples), periodically continued."""
+        it takes one period of time samples, periodically continued."""
         return None
 
     def loss(self, p: Values, at: Conditions, modes: list[Mode]) -> Loss | None:
@@ -468,7 +479,7 @@ class Structure:
             n = e.characteristic(p, n, at)
         for e in self.effects:
             if (operator := e.operator(p)) is not None:
-                n = Preceded(n, operator, e.mixes)
+                n = Preceded(n, operator)
         return n
 
     def flame_path(self, p: Values, at: Conditions, s: Any) -> Any:

@@ -1,6 +1,6 @@
 """Actuator: what stands between the recorded drive and the sound at the speaker."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -193,13 +193,15 @@ class HardClipping(Effect):
         return [(share * known.drive_amplitude,) for share in (0.25, 0.5, 0.7, 0.85, 0.96)]
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        if not np.any(dual.value(u)):
+            return u
         K, level = at.harmonics, p["actuator_nonlinearity.level_v"]
         wave = balance.to_time(u, K, FINE)
         v = dual.value(wave)
         cut = np.clip(v, -dual.value(level), dual.value(level))
         # only the cut samples depend on the level; their harmonics are its derivative
         moved = np.sign(v) * (np.abs(v) > dual.value(level))
-        return _behind(wave, cut, 1 - np.abs(moved), K, (moved, level))
+        return _behind(wave, cut, 1 - np.abs(moved), K, (lambda: moved, level))
 
 
 class Crossover(Effect):
@@ -232,6 +234,8 @@ class Knee(Effect):
         return [(share * u, n) for share in (0.35, 0.6, 0.9) for n in (3.0, 8.0)]
 
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        if not np.any(dual.value(u)):
+            return u
         K = at.harmonics
         L, n = p["actuator_nonlinearity.level_v"], p["actuator_nonlinearity.order"]
         level, order = dual.value(L), dual.value(n)
@@ -242,18 +246,32 @@ class Knee(Effect):
         q = 1.0 + power
         gain = q ** (-1.0 / order)
         out = v * gain
-        by_level = out * power / q / level
-        by_order = out * (np.log(q) / order**2 - power * np.log(ratio) / (order * q))
+
+        def by_level() -> FloatArray:
+            return np.asarray(out * power / q / level)
+
+        def by_order() -> FloatArray:
+            bend = np.log(q) / order**2 - power * np.log(ratio) / (order * q)
+            return np.asarray(out * bend)
+
         return _behind(wave, out, gain / q, K, (by_level, L), (by_order, n))
 
 
 def _behind(
-    wave: Any, out: FloatArray, slope: FloatArray, harmonics: int, *by: tuple[FloatArray, Any]
+    wave: Any,
+    out: FloatArray,
+    slope: FloatArray,
+    harmonics: int,
+    *by: tuple[Callable[[], FloatArray], Any],
 ) -> Any:
     """Harmonics of what is `out` behind a curve of that `slope` at each sample of a wave, with its
     derivatives `by` the curve's own parameters."""
     # parameters vary all samples alike: their derivatives are taken to harmonics before the seeds
-    terms = [(balance.to_harmonics(partial, harmonics, FINE), x) for partial, x in by]
+    terms = [
+        (balance.to_harmonics(partial(), harmonics, FINE), x)
+        for partial, x in by
+        if isinstance(x, Dual)
+    ]
     total = dual.chain(balance.to_harmonics(out, harmonics, FINE), *terms)
     if not isinstance(wave, Dual):
         return total

@@ -7,10 +7,17 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
-from identify.dual import Dual
 from identify.parameters import Parameter
 from identify.polynomial import Polynomial
-from identify.structure import Characteristic, Conditions, Effect, Known, Values
+from identify.structure import (
+    Characteristic,
+    Conditions,
+    Effect,
+    Known,
+    Operator,
+    Passed,
+    Values,
+)
 
 Samples = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -121,14 +128,15 @@ class DeadZone(Effect):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(q * known.flame_input_amplitude,) for q in (0.005, 0.03, 0.15)]
 
-    def operator(self, p: Values) -> Characteristic:
+    def operator(self, p: Values) -> Operator:
         width = p["nonlinearity_shape.width"]
 
-        def zone(w: Any) -> Any:
-            x = dual.value(w)
+        def zone(w: Samples) -> Passed:
             half = dual.value(width)
-            side = np.where(np.abs(x) > half, np.sign(x), 0.0)
-            return dual.chain(side * (np.abs(x) - half), (np.abs(side), w), (-side, width))
+            side = np.where(np.abs(w) > half, np.sign(w), 0.0)
+            own = np.broadcast_to(np.arange(w.shape[1]), w.shape)
+            out = side * (np.abs(w) - half)
+            return Passed(out, [(np.abs(side), own)], [(-side, width)])
 
         return zone
 
@@ -167,23 +175,21 @@ class Hysteresis(Effect):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(q * known.flame_input_amplitude,) for q in (0.002, 0.02, 0.1)]
 
-    def operator(self, p: Values) -> Characteristic:
-        return lambda w: play(w, p["nonlinearity_shape.width"])
+    def operator(self, p: Values) -> Operator:
+        width = p["nonlinearity_shape.width"]
+        return lambda w: play(w, width)
 
 
-def play(w: Any, width: Any) -> Any:
+def play(w: Samples, width: Any) -> Passed:
     """The play operator over one period of samples `w` (runs, samples), of half-width `width`."""
-    x = np.ascontiguousarray(dual.value(w))
+    x = np.ascontiguousarray(w)
     half = np.ascontiguousarray(
         np.broadcast_to(dual.value(width), (x.shape[0], 1))[:, 0], dtype=np.float64
     )
     at, side = _contacts(x, half)
-    row = np.arange(x.shape[0])[:, None]
-    y = x[row, at] + side * half[:, None]
     # what was touched last is remembered: value and derivative of that moment
-    touched = None if not isinstance(w, Dual) else Dual(x[row, at], w.d[row, at])
-    one = np.ones_like(y)
-    return dual.chain(y, (one, touched), (side, width))
+    out = np.take_along_axis(x, at, axis=1) + side * half[:, None]
+    return Passed(out, [(np.ones_like(out), at)], [(side, width)])
 
 
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]

@@ -13,7 +13,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
+from identify import dual
 from identify.effects.actuator import Distortion
 from identify.effects.experiment import course
 from identify.effects.forward import AcousticMode, NonlinearDamping
@@ -22,15 +24,18 @@ from identify.effects.scatter import Change, DriveGain, DrivePhase, Scatter, Sen
 from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
 from identify.structure import (
-    Characteristic,
     Conditions,
     Effect,
     Known,
     Loss,
     Mode,
+    Operator,
+    Passed,
     Structure,
     Values,
 )
+
+FloatArray = npt.NDArray[np.float64]
 
 STEPS = 4
 MODE = AcousticMode()
@@ -212,7 +217,7 @@ class ShapedMemory(Shaped):
     """A rate-independent memory of the flame's input: w + Σ_j a_j (P_j(w) − w) of plays P_j, each
     half as wide as the one before (Prandtl and Ishlinskii's model)."""
 
-    location, form, linear, mixes = "nonlinearity", "memory", False, True
+    location, form, linear = "nonlinearity", "memory", False
     besides = (
         Parameter("shaped_nonlinearity.reach", "m", 0.0, np.inf, "positive"),
         *(Parameter(f"shaped_nonlinearity.play{j}", "1", scale=1e-2) for j in (1, 2, 3)),
@@ -225,16 +230,25 @@ class ShapedMemory(Shaped):
     def neutral(self) -> None:
         return None
 
-    def operator(self, p: Values) -> Characteristic:
+    def operator(self, p: Values) -> Operator:
         reach, *shares = (p[q.name] for q in self.besides)
 
-        def remembered(w: Any) -> Any:
-            taken, *others = shares
-            total = play(w, reach) * taken
-            for j, share in enumerate(others, start=1):
-                total = total + play(w, reach * 0.5**j) * share
-                taken = taken + share
-            return total + w * (1.0 - taken)
+        def remembered(w: FloatArray) -> Passed:
+            halves = [0.5**j for j in range(len(shares))]
+            plays = [play(w, dual.value(reach) * half) for half in halves]
+            sizes = [np.broadcast_to(dual.value(a), (len(w), 1)) for a in shares]
+            total, own = w.copy(), np.broadcast_to(np.arange(w.shape[1]), w.shape)
+            follows = [(np.broadcast_to(1.0 - sum(sizes), w.shape), own)]
+            by_reach = np.zeros_like(w)
+            by: list[tuple[FloatArray, Any]] = [(by_reach, reach)]
+            for passed, half, size, share in zip(plays, halves, sizes, shares, strict=True):
+                behind = passed.output - w
+                total += size * behind
+                follows += [(size * slope, at) for slope, at in passed.follows]
+                for side, _ in passed.by:
+                    by_reach += half * size * side
+                by.append((behind, share))
+            return Passed(total, follows, by)
 
         return remembered
 

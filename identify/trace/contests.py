@@ -220,17 +220,14 @@ def _in_form(item: _Exchange) -> Fit | None:
         near = taken if moving == "mode" else rows  # of a mode there are starts anywhere
         alike = [matched(larger, row, t.fit, data, moving) for row in near]
         taken += [theta for theta in alike if theta is not None]
-    starts = coarse(larger, data, [*rows, *taken])[:2]
-    fits = []
-    if starts:
-        first = np.stack([s.theta for s in starts])
-        bar = NO_RIVAL if t.explains else np.inf  # of rivals only those near to the noise matter
-        steps = (0.003, 0.0)
-        fits.append(
-            fit_orbits(larger, data, first, continuation=steps, iterations=30, hopeless=bar)
-        )
-    if taken:  # what `t` knows to within the noise, coarse noise would lose
-        fits.append(fit_orbits(larger, data, np.stack(taken), continuation=(0.0,), iterations=30))
+    starts = [s.theta for s in coarse(larger, data, [*rows, *taken])[:2]]
+    bar = NO_RIVAL if t.explains else np.inf  # of rivals only those near to the noise matter
+    # what `t` knows to within the noise, coarse noise would lose
+    fits = [
+        fit_orbits(larger, data, np.stack(begun), continuation=steps, iterations=30, hopeless=bar)
+        for begun, steps in ((starts, (0.003, 0.0)), (taken, (0.0,)))
+        if begun
+    ]
     return min(fits, key=lambda f: f.chi2, default=None)
 
 
