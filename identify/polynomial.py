@@ -49,7 +49,7 @@ class Polynomial:
     def __call__(self, w: Any) -> Any:
         x = dual.value(w)
         value, slope = self.curve(x)
-        return dual.chain(value, (slope + np.zeros_like(x), w), *self.terms(x))
+        return dual.chain(value, (slope, w), *self.terms(x))
 
     def terms(self, x: FloatArray) -> list[tuple[FloatArray, Dual]]:
         """N's partial derivatives at time samples by those coefficients that carry derivatives,

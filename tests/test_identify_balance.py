@@ -123,6 +123,41 @@ def test_slopes_of_a_memory_of_several_plays_agree_with_differences() -> None:
     assert_slopes_agree_with_differences(ShapedMemory(FREE_HZ, 2), [800.0, 0.5, -0.7, 0.9])
 
 
+@pytest.mark.parametrize(
+    ("effect", "own"),
+    [
+        (by_key("nonlinearity_shape:dead_zone"), [800.0]),
+        (by_key("nonlinearity_shape:hysteresis"), [800.0]),
+        (ShapedMemory(FREE_HZ, 2), [800.0, 0.5, -0.7, 0.9]),
+    ],
+)
+def test_what_is_behind_an_operator_changes_with_its_parameters(
+    effect: Effect, own: Sequence[float]
+) -> None:
+    """Exact derivatives by the operator's and the curve's parameters, against differences."""
+    rng = np.random.default_rng(3)
+    v = rng.normal(size=(2, K)) * 3000 / np.arange(1, K + 1) + 0j
+    structure, at = Structure(effects=(effect,)), forced_conditions().take(np.arange(2))
+    names, shaping = structure.parameters.names, structure.shaping
+    values = {**true_values(), **dict(zip((q.name for q in effect.parameters), own, strict=True))}
+    theta0 = structure.parameters.to_internal([values[n] for n in names])
+    plain = structure.parameters.plain(theta0[None], 2)
+    seeded = structure.parameters.seeded(theta0[None], 2, only=shaping)
+    (n,) = structure.characteristics({**plain, **seeded}, at)
+    exact = balance._force(n, v, K)
+    for j, i in enumerate(shaping):
+        sides = []
+        step = 1e-6 * max(abs(theta0[i]), 1e-6)
+        for sign in (1, -1):
+            moved = theta0.copy()
+            moved[i] += sign * step
+            (n,) = structure.characteristics(structure.parameters.plain(moved[None], 2), at)
+            sides.append(balance._force(n, v, K))
+        difference = (sides[0] - sides[1]) / (2 * step)
+        size = np.max(np.abs(difference))
+        np.testing.assert_allclose(exact.d[..., j], difference, atol=1e-7 * size, err_msg=names[i])
+
+
 def test_several_vectors_at_once_equal_one_by_one() -> None:
     structure = Structure()
     at = forced_conditions()

@@ -237,18 +237,15 @@ class ShapedMemory(Shaped):
             halves = [0.5**j for j in range(len(shares))]
             plays = [play(w, dual.value(reach) * half) for half in halves]
             sizes = [np.broadcast_to(dual.value(a), (len(w), 1)) for a in shares]
-            total, own = w.copy(), np.broadcast_to(np.arange(w.shape[1]), w.shape)
-            follows = [(np.broadcast_to(1.0 - sum(sizes), w.shape), own)]
+            behind = [passed.output - w for passed in plays]
+            total = w + sum(size * b for size, b in zip(sizes, behind, strict=True))
+            rest = np.broadcast_to(1.0 - sum(sizes), w.shape)
+            follows = [(rest, np.broadcast_to(np.arange(w.shape[1]), w.shape))]
             by_reach = np.zeros_like(w)
-            by: list[tuple[FloatArray, Any]] = [(by_reach, reach)]
-            for passed, half, size, share in zip(plays, halves, sizes, shares, strict=True):
-                behind = passed.output - w
-                total += size * behind
+            for passed, half, size in zip(plays, halves, sizes, strict=True):
                 follows += [(size * slope, at) for slope, at in passed.follows]
-                for side, _ in passed.by:
-                    by_reach += half * size * side
-                by.append((behind, share))
-            return Passed(total, follows, by)
+                by_reach = by_reach + sum(half * size * side for side, _ in passed.by)
+            return Passed(total, follows, [(by_reach, reach), *zip(behind, shares, strict=True)])
 
         return remembered
 
