@@ -13,7 +13,7 @@ Derivatives come from the implicit function theorem, ∂x/∂θ = −R_x⁻¹ R_
 differentiation of the assembled equations: exact, and the solver itself is never differenced.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -43,6 +43,7 @@ IntArray = npt.NDArray[np.int64]
 TOLERANCE = 1e-10  # relative Newton residual: far below any noise, above rounding
 MAX_ITERATIONS = 12  # Newton steps; twice as many where ω is an unknown too
 NEAR = 1e-7  # of ω: within that, the terms' first order in ω is exact to far below any noise
+APART = 1e-6  # of ω: over that far slopes by ω are taken, to 1e-4 of themselves at the sharpest
 FINE = 1024  # samples a period of a `Preceded` characteristic: turning points to 5e-6 of the swing
 
 
@@ -188,11 +189,11 @@ def _newton(
     rows, left = np.arange(at.runs), limit
     with np.errstate(all="ignore"):
         while rows.size:
-            loop, terms = _assembled(structure, p, at, omega[rows], len(v))
-            found = _solved(loop.N, terms, v[:, rows], omega[rows], at.free, left)
+            near = _assembled(structure, p, at, omega[rows], len(v))
+            found = _solved(near, v[:, rows], omega[rows], at.free, left)
             away = found[1] - omega[rows]
             v[:, rows], omega[rows], error[rows], taken, forces = found
-            predicted[rows] = _moved(_velocity(loop, forces), away)
+            predicted[rows] = near.velocity(forces, away)
             # the others were solved where the terms were assembled, or near enough
             again = np.flatnonzero(at.free & (taken > 0) & ~(np.abs(away) < NEAR * omega[rows]))
             rows, left, at = rows[again], (left - taken)[again], at.take(again)
@@ -201,62 +202,69 @@ def _newton(
     return Orbits(v, predicted, omega, converged)
 
 
-def _moved(x: Any, away: FloatArray) -> ComplexArray:
-    """Values (runs, K) at frequencies so far `away`, to first order, from those with ω as seed."""
-    if not isinstance(x, Dual):
-        return np.asarray(x)
-    return np.asarray(x.v + x.d[..., 0] * away[:, None])
+@dataclass(frozen=True)
+class _Assembled:
+    """The equations of some rows at harmonics of given frequencies, and their slopes by ω.
+
+    P (loops, loops, rows, K), Q (loops, rows, K); of free runs `loop` holds one row more each,
+    behind the others: at a frequency higher by `apart`, (free runs,), from which the slopes come.
+    """
+
+    loop: Loop
+    N: tuple[Characteristic, ...]
+    P: ComplexArray
+    Q: ComplexArray
+    dP: ComplexArray
+    dQ: ComplexArray
+    free: IntArray
+    apart: FloatArray
+
+    def velocity(self, forces: ComplexArray, away: FloatArray) -> ComplexArray:
+        """Predicted measurement (rows, K) where ω is so far away, to first order."""
+        y = np.array(_velocity(self.loop, np.concatenate([forces, forces[:, self.free]], axis=1)))
+        rows = forces.shape[1]
+        slope = (y[rows:] - y[self.free]) / self.apart[:, None]
+        y[self.free] += slope * away[self.free, None]
+        return y[:rows]
+
+
+def _assembled(
+    structure: Structure, p: Values, at: Conditions, omega: FloatArray, loops: int
+) -> _Assembled:
+    K, rows, free = at.harmonics, at.runs, np.flatnonzero(at.free)
+    apart, N = APART * omega[free], structure.characteristics(p, at)
+    if free.size:
+        both = np.concatenate([np.arange(rows), free])
+        p, at = {n: x[both] for n, x in p.items()}, at.take(both)
+        omega = np.concatenate([omega, omega[free] + apart])
+    loop = structure.assemble(p, at, 1j * omega[:, None] * np.arange(1, K + 1))
+    P = np.empty((loops, loops, at.runs, K), dtype=complex)
+    Q = np.empty((loops, at.runs, K), dtype=complex)
+    for a in range(loops):
+        Q[a] = loop.Q[a]
+        for b in range(loops):
+            P[a, b] = loop.P[a][b]
+    dP, dQ = np.zeros_like(P[:, :, :rows]), np.zeros_like(Q[:, :rows])
+    dP[:, :, free] = (P[:, :, rows:] - P[:, :, free]) / apart[:, None]
+    dQ[:, free] = (Q[:, rows:] - Q[:, free]) / apart[:, None]
+    P, Q = np.ascontiguousarray(P[:, :, :rows]), np.ascontiguousarray(Q[:, :rows])
+    return _Assembled(loop, N, P, Q, dP, dQ, free, apart)
 
 
 def _solved(
-    N: Sequence[Characteristic],
-    terms: "_Terms",
+    near: _Assembled,
     v: ComplexArray,
     omega: FloatArray,
     free: BoolArray,
     left: IntArray,
 ) -> tuple[ComplexArray, FloatArray, FloatArray, IntArray, ComplexArray]:
     """Inputs, frequencies, relative residuals, steps taken and N̂ with the terms as they are."""
-    if not all(isinstance(n, Polynomial) for n in N):
-        return _sampled_newton(N, terms, v, omega, free, left)
-    curves, waves = _tables(N, omega.size), _waves(v.shape[2], _samples(N, v.shape[2]))
+    if not all(isinstance(n, Polynomial) for n in near.N):
+        return _sampled_newton(near, v, omega, free, left)
+    curves, waves = _tables(near.N, omega.size), _waves(v.shape[2], _samples(near.N, v.shape[2]))
+    terms = near.P, near.Q, near.dP, near.dQ
     found = newton(*terms, curves, v, omega, *waves, free, left, TOLERANCE)
     return v, omega, *found
-
-
-@dataclass(frozen=True)
-class _Terms:
-    """P (loops, loops, runs, K) and Q (loops, runs, K) and their derivatives by ω."""
-
-    P: ComplexArray
-    Q: ComplexArray
-    dP: ComplexArray
-    dQ: ComplexArray
-
-    def __iter__(self) -> Iterator[ComplexArray]:
-        return iter((self.P, self.Q, self.dP, self.dQ))
-
-
-def _assembled(
-    structure: Structure, p: Values, at: Conditions, omega: FloatArray, loops: int
-) -> tuple[Loop, _Terms]:
-    """The equations at harmonics of `omega`; with free runs, Duals with their ω as only seed."""
-    K = at.harmonics
-    k = np.arange(1, K + 1)
-    s: Any = 1j * omega[:, None] * k
-    if at.free.any():
-        s = Dual(s, (at.free[:, None] * (1j * k))[..., None])
-    loop = structure.assemble(p, at, s)
-    P = np.empty((2, loops, loops, at.runs, K), dtype=complex)
-    Q = np.empty((2, loops, at.runs, K), dtype=complex)
-    for a in range(loops):
-        for out, term in (
-            (Q[:, a], loop.Q[a]),
-            *((P[:, a, b], loop.P[a][b]) for b in range(loops)),
-        ):
-            out[0] = dual.value(term)
-            out[1] = term.d[..., 0] if isinstance(term, Dual) else 0.0
-    return loop, _Terms(P[0], Q[0], P[1], Q[1])
 
 
 def _tables(curves: Sequence[Characteristic], rows: int) -> FloatArray:
@@ -269,8 +277,7 @@ def _tables(curves: Sequence[Characteristic], rows: int) -> FloatArray:
 
 
 def _sampled_newton(
-    N: Sequence[Characteristic],
-    terms: _Terms,
+    near: _Assembled,
     v: ComplexArray,
     omega: FloatArray,
     free: BoolArray,
@@ -280,8 +287,8 @@ def _sampled_newton(
     K, begin, taken = v.shape[2], omega, np.zeros_like(limit)
     while True:
         away = (omega - begin)[:, None]
-        P, Q = terms.P + away * terms.dP, terms.Q + away * terms.dQ
-        forces = np.stack([_force(n, x, K) for n, x in zip(N, v, strict=True)])
+        P, Q = near.P + away * near.dP, near.Q + away * near.dQ
+        forces = np.stack([_force(n, x, K) for n, x in zip(near.N, v, strict=True)])
         R = v - Q - np.einsum("abrk,brk->ark", P, forces)
         size = np.sqrt(np.sum(np.abs(v) ** 2, axis=2)) + 1e-300
         error = np.max(np.sqrt(np.sum(np.abs(R) ** 2, axis=2)) / size, axis=0)
@@ -289,9 +296,9 @@ def _sampled_newton(
         going = (taken < limit) & (error >= TOLERANCE) & np.isfinite(error)
         if not going.any():
             return v, omega, error, taken, forces
-        J = _jacobian(tuple(map(tuple, P)), _slopes(N, v), K)
+        J = _jacobian(tuple(map(tuple, P)), _slopes(near.N, v), K)
         if free.any():  # the column of Im v_0,1, which stays 0, becomes ω's
-            by_omega = -terms.dQ - np.einsum("abrk,brk->ark", terms.dP, forces)
+            by_omega = -near.dQ - np.einsum("abrk,brk->ark", near.dP, forces)
             J[free, :, K] = _stack(by_omega)[free]
         step = np.where(going[:, None], _solve(J, _stack(R)), 0.0)
         away_by = np.where(free, np.clip(step[:, K], -0.05 * omega, 0.05 * omega), 0.0)

@@ -15,7 +15,7 @@ all runs pull evenly; lowered step by step to zero, it leads the fit in (continu
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from typing import Protocol
 
@@ -37,6 +37,8 @@ LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
 HOPE = 20  # iterations for what may be given up as hopeless …
 SHORTLY = 10  # … and for fits of which only those near to the noise matter
 VALLEY = 20  # iterations after which a descent is taken to follow one
+STUCK = 8  # accepted steps of which nothing comes although the tangents promise nearly all …
+FAR = 30.0  # … of so many times what noise leaves
 PROBE = 0.3  # of a step, where its curvature is looked at
 BENT = 0.4  # of the step that the bend may be
 
@@ -71,6 +73,12 @@ class Fit:
     @property
     def values(self) -> dict[str, float]:
         return self.structure.parameters.plain(self.theta)
+
+
+def no_better(fit: Fit, data: Dataset) -> float:
+    """The misfit of a fit, in times what noise leaves: what adds to its model, or takes its place,
+    and promises no less than that has gone where nothing is."""
+    return fit.chi2 / data.residuals if fit.converged else np.inf
 
 
 def soften(batches: Sequence[Batch], share: float) -> tuple[Batch, ...]:
@@ -413,10 +421,21 @@ class _State:
     factors: _Factors | None = None
     ended: str | None = None
     converged: bool = False
+    costs: list[float] = field(default_factory=list)  # at the start of each iteration
 
     @property
     def cost(self) -> float:
         return float(self.residual @ self.residual)
+
+    @property
+    def stuck(self) -> bool:
+        """Whether it creeps along an edge beyond which no orbit exists, far from the noise: what
+        remains is as good as linear, and yet hardly a step is taken."""
+        assert self.factors is not None
+        now, far = self.costs[-1], FAR * self.residual.size
+        if len(self.costs) <= STUCK or now < far or self.factors.promise < 0.99 * now:
+            return False
+        return self.costs[-1 - STUCK] - now < 1e-3 * now
 
 
 def levenberg_marquardt(
@@ -437,9 +456,9 @@ def levenberg_marquardt(
     step still to come would lower χ² by less than `tolerance` (absolute and relative): a hundredth
     of what a thousandth of a standard error is worth. Unknowns are scaled by the Jacobian's
     columns (Marquardt), damping follows the gain ratio (Nielsen); a descent ends after more than
-    `patience` refused steps in a row, or where after `hope` iterations even what its tangents
-    promise of |ρ|² is beyond `hopeless`. Unknowns at a bound that the gradient pushes against are
-    held there; `bounds` are (p,) each, or (starts, p).
+    `patience` refused steps in a row, where it creeps along an edge of what exists, or where after
+    `hope` iterations even what its tangents promise of |ρ|² is beyond `hopeless`. Unknowns at a
+    bound that the gradient pushes against are held there; `bounds` are (p,) each, or (starts, p).
     """
     count, p = thetas.shape
     limits = bounds if bounds is not None else (np.full(p, -np.inf), np.full(p, np.inf))
@@ -513,6 +532,7 @@ def _propose(
     """The next step of a descent and its predicted decrease, or None where it has ended."""
     if s.refused == 0:
         s.iterations += 1
+        s.costs.append(s.cost)
         s.factors = _factors(s, low, high)
     assert s.factors is not None
     promise = s.factors.promise
@@ -523,6 +543,9 @@ def _propose(
     if s.refused > patience:
         s.converged = promise < 1e-3 * enough
         s.ended = "converged" if s.converged else "no step lowers the misfit any further"
+        return None
+    if s.stuck:
+        s.ended = "stuck at an edge beyond which no orbit exists"
         return None
     if s.iterations > hope and s.cost - promise > hopeless:
         s.ended = "given up far from any solution"

@@ -39,13 +39,9 @@ class Parameter:
     def to_internal(self, value: float) -> float:
         return float(np.log(max(value, 1e-300))) if self.kind == "positive" else value / self.scale
 
-    def to_physical(self, internal: Any) -> Any:
-        """Physical value of an unknown (float or Dual)."""
-        return dual.exp(internal) if self.kind == "positive" else internal * self.scale
-
-    def slope(self, internal: float) -> float:
-        """d(physical)/d(internal)."""
-        return float(np.exp(internal)) if self.kind == "positive" else self.scale
+    def to_physical(self, internal: float) -> float:
+        """Physical value of an unknown."""
+        return float(np.exp(internal)) if self.kind == "positive" else internal * self.scale
 
     def plausible(self, value: float) -> bool:
         """Whether it lies in the range; a positive one, kept there by the fit, not at its edge."""
@@ -99,11 +95,20 @@ class ParameterSet:
         return np.array([p.to_internal(float(v)) for p, v in pairs])
 
     def to_physical(self, internal: FloatArray) -> FloatArray:
-        pairs = zip(self.parameters, internal, strict=True)
-        return np.array([float(p.to_physical(float(t))) for p, t in pairs])
+        """Physical values of a vector of unknowns, or of several, (…, p)."""
+        return np.where(self._positive, np.exp(internal * self._positive), internal * self._scales)
 
     def slopes(self, internal: FloatArray) -> FloatArray:
-        return np.array([p.slope(float(t)) for p, t in zip(self.parameters, internal, strict=True)])
+        """d(physical)/d(internal), (…, p)."""
+        return np.where(self._positive, self.to_physical(internal), self._scales)
+
+    @cached_property
+    def _positive(self) -> npt.NDArray[np.bool_]:
+        return np.array([p.kind == "positive" for p in self.parameters], dtype=bool)
+
+    @cached_property
+    def _scales(self) -> FloatArray:
+        return np.array([p.scale for p in self.parameters])
 
     def seeded(
         self, internal: FloatArray, rows: int, extra: int = 0, only: IntArray | None = None
@@ -115,20 +120,20 @@ class ParameterSet:
         of these parameters alone, a seed each in their order.
         """
         chosen = np.arange(len(self)) if only is None else only
-        unit = np.eye(chosen.size, chosen.size + extra)
-        columns = np.repeat(internal, rows, axis=0)
+        unit = np.eye(chosen.size, chosen.size + extra)[:, None, None, :]
+        columns = np.repeat(self.to_physical(internal), rows, axis=0)
+        slopes = np.repeat(self.slopes(internal), rows, axis=0)
         return {
-            q.name: q.to_physical(dual.Dual(columns[:, j : j + 1], unit[i][None, None, :]))
+            self.names[j]: dual.Dual(columns[:, j : j + 1], unit[i] * slopes[:, j, None, None])
             for i, j in enumerate(chosen)
-            for q in [self.parameters[j]]
         }
 
     def plain(self, internal: FloatArray, rows: int = 0) -> dict[str, Any]:
         """Physical values by name: floats of one vector (p,), or (vectors·rows, 1) of several."""
         if internal.ndim == 1:
             return dict(zip(self.names, self.to_physical(internal).tolist(), strict=True))
-        columns = np.repeat(internal, rows, axis=0)
-        return {q.name: q.to_physical(columns[:, j : j + 1]) for j, q in enumerate(self.parameters)}
+        columns = np.repeat(self.to_physical(internal), rows, axis=0)
+        return {name: columns[:, j : j + 1] for j, name in enumerate(self.names)}
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:
         """Box for the unknowns: a positive quantity stays within its plausible range (where that

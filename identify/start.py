@@ -33,6 +33,7 @@ from identify.fit import (
     failed,
     fit_orbits,
     levenberg_marquardt,
+    no_better,
     soften,
 )
 from identify.structure import Effect, Mode, Structure, Values, at_the_flame
@@ -666,4 +667,5 @@ def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) ->
         if not any(_near(structure, candidate.theta, other) for other in distinct):
             distinct.append(candidate.theta)
     chosen = np.stack(distinct[:8])
-    return [fit_orbits(structure, data, chosen, continuation=(0.003, 0.0), iterations=120)]
+    worse, steps = no_better(near, data), (0.003, 0.0)
+    return [fit_orbits(structure, data, chosen, continuation=steps, iterations=120, hopeless=worse)]

@@ -82,7 +82,15 @@ class Conditions:
 
     def tile(self, times: int) -> "Conditions":
         """All runs repeated `times` times, for as many parameter vectors at once."""
-        return self.take(np.tile(np.arange(self.runs), times)) if times > 1 else self
+        if times == 1:
+            return self
+        if times not in self._tiled:
+            self._tiled[times] = self.take(np.tile(np.arange(self.runs), times))
+        return self._tiled[times]
+
+    @cached_property
+    def _tiled(self) -> dict[int, "Conditions"]:
+        return {}
 
     def padded(self, harmonics: int) -> "Conditions":
         """The same with columns of zeros up to so many harmonics, where there are fewer."""

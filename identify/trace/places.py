@@ -15,7 +15,7 @@ import numpy as np
 from identify.dataset import Dataset
 from identify.effects.shaped import CHANCES, PIECES, Shaped, ShapedMemory
 from identify.executor import Executor
-from identify.fit import Fit, fit_orbits
+from identify.fit import Fit, fit_orbits, no_better
 from identify.results import Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
 from identify.structure import Effect, Structure
@@ -200,4 +200,5 @@ def _shape(item: tuple[Structure, Dataset, Effect, Sequence[Fit]]) -> Fit | None
     if not led:
         return None
     thetas = np.stack([s.theta for s in led])
-    return fit_orbits(structure, data, thetas, continuation=(last, 0.0))
+    hopeless = no_better(bases[0], data)
+    return fit_orbits(structure, data, thetas, continuation=(last, 0.0), hopeless=hopeless)

@@ -17,7 +17,7 @@ from identify import assess
 from identify.dataset import Dataset
 from identify.effects.scatter import Scatter
 from identify.executor import Executor
-from identify.fit import Fit, fit_orbits
+from identify.fit import Fit, fit_orbits, no_better
 from identify.scatter import Spread, fit_scatter
 from identify.start import (
     CoarseStart,
@@ -316,7 +316,7 @@ def try_effects(
     known = known_sizes(data, base)
     rough = data.coarse()
     shares = shares_of(base, data)
-    hopeless = NO_RIVAL if rivals else np.inf
+    hopeless = min(NO_RIVAL if rivals else np.inf, no_better(base, data))
     tasks = [
         _Task(structure, data, rough, base, e, known, shares, scores.get(e.key), hopeless)
         for e in effects
@@ -425,7 +425,9 @@ def _again(item: tuple[Tried, Dataset]) -> Fit:
     starts = coarse(larger, rough, exact)[:5] + physical_starts(larger, rough, [row])[:5]
     polished = polish(larger, rough, starts, shares=(0.05, 0.01), iterations=10)[:3]
     thetas = np.stack([*(s.theta for s in polished), t.fit.theta])
-    return fit_orbits(larger, data, thetas, continuation=(0.003, 0.0), iterations=100)
+    worse = t.fit.chi2 / data.residuals
+    steps = (0.003, 0.0)
+    return fit_orbits(larger, data, thetas, continuation=steps, iterations=100, hopeless=worse)
 
 
 def _restated_starts(t: Tried, clean: Dataset) -> list[FloatArray]:
