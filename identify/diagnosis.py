@@ -33,11 +33,13 @@ from identify.results import (
 )
 from identify.structure import Effect, Structure
 from identify.trace import ALPHA, Cancelled, Tried
+from identify.trace.tried import best_by_name
 from identify.trace.tried import tried as as_tried
 
 Progress = Callable[[float, str], None]
 
 SHOWN = 12  # candidates in the report
+REFITTED = 6  # sets of effects that are fitted again where the data's covariances have changed
 DOUBTFUL = 0.05  # probability of a claim's lack of fit below which free shapes contest it
 
 
@@ -98,7 +100,9 @@ def diagnose(
             if better is not recorded:
                 data, ready = better, replace(ready, data=better)
                 declared = _declared(fit, ready, catalogue, run)
-                tried = trace.refitted(tried, data)
+                laws = [t for t in best_by_name(tried) if t.spread is None]
+                tried = trace.refitted(laws[:REFITTED], data)
+                searched = data, declared.fit, trace.refitted(found.pieces, data)
         # what an effect explains, a better start of the declared model may explain without it
         once_more = trace.without_effects(ready.structure, data, tried)
         if once_more is not None and _better(once_more, declared.fit):

@@ -593,16 +593,17 @@ def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried])
     return fit if np.isfinite(fit.chi2) else None
 
 
-def refitted(tries: Sequence[Tried], data: Dataset, keep: int = 6) -> list[Tried]:
-    """The best of each set of effects fitted to `data`, whose covariances have changed, from where
-    they ended. A spread, which has widened its own data, is left out."""
-    best = [t for t in best_by_name(tries) if t.spread is None][:keep]
+def refitted(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
+    """Fitted to `data`, whose covariances have changed, from where they ended; best first. Spreads,
+    which have widened their own data, are left out."""
     out = []
-    for t in best:
+    for t in tries:
+        if t.spread is not None:
+            continue
         fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.0,))
         if np.isfinite(fit.chi2):
             out.append(tried(t.effects, fit, data))
-    return out
+    return sorted(out, key=misfit)
 
 
 def _fuller(catalogue: Sequence[Effect], data: Dataset, structure: Structure) -> tuple[Effect, ...]:
