@@ -366,6 +366,7 @@ def test_each_form_that_might_be_a_rival_is_led_to_its_end(tmp_path: Path) -> No
     assert [t.fit.chi2 for t in led] == [pytest.approx(lag.fit.chi2, abs=0.1)]
 
 
+@pytest.mark.slow
 def test_which_mode_is_the_further_one_is_named_by_rule_beside_another_effect(
     tmp_path: Path,
 ) -> None:
@@ -782,6 +783,7 @@ def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> No
     assert abs(change.value - 0.0015 * over) < 4 * change.stderr
 
 
+@pytest.mark.slow
 def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
     """Each leads the other astray, but where more noise hides the scatter the distortion is seen:
     eight per mille of the drive, and three, at 80 dB."""
@@ -807,6 +809,7 @@ def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
     assert a2.stderr < 1e-4
 
 
+@pytest.mark.slow
 def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
     """The speaker warms while all frequencies wander: two kinds of drift."""
     both = [

@@ -212,6 +212,7 @@ def test_two_further_modes_wherever_they_are(seed: int, tmp_path: Path) -> None:
     assert best.explains
 
 
+@pytest.mark.slow
 def test_two_further_modes_beside_another_effect(tmp_path: Path) -> None:
     """No pair of other effects comes near; from the modes alone the other is found."""
     gain = {"channel_mismatch/gain": {"gain": 0.01}}

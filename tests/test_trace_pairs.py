@@ -46,6 +46,7 @@ def test_a_further_mode_beside_another_gross_effect(tmp_path: Path) -> None:
     assert said[-1] == "refitting pairs"
 
 
+@pytest.mark.slow
 def test_where_no_single_effect_comes_near_pairs_are_sought_at_once(tmp_path: Path) -> None:
     """Sound that takes time from the cone to the tube, and a flame that answers late."""
     effects = {"actuator_dynamics/delay": {"delay_s": 5e-4}, "flame_delay": {"delay_s": DELAY_S}}
@@ -58,6 +59,7 @@ def test_where_no_single_effect_comes_near_pairs_are_sought_at_once(tmp_path: Pa
     assert abs(delay.value - DELAY_S) < 4 * delay.stderr
 
 
+@pytest.mark.slow
 def test_an_offset_is_seen_in_a_further_mode_too(tmp_path: Path) -> None:
     """Two modes are declared: a form for three of them is there beside an effect that brings one,
     and only there."""

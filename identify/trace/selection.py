@@ -594,16 +594,10 @@ def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried])
 
 
 def refitted(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
-    """Fitted to `data`, whose covariances have changed, from where they ended; best first. Spreads,
-    which have widened their own data, are left out."""
-    out = []
-    for t in tries:
-        if t.spread is not None:
-            continue
-        fit = fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.0,))
-        if np.isfinite(fit.chi2):
-            out.append(tried(t.effects, fit, data))
-    return sorted(out, key=misfit)
+    """Laws fitted to `data`, whose covariances have changed, from where they ended; best first."""
+    fits = [fit_orbits(t.fit.structure, data, t.fit.theta, continuation=(0.0,)) for t in tries]
+    found = [tried(f.structure.effects, f, data) for f in fits if np.isfinite(f.chi2)]
+    return sorted(found, key=misfit)
 
 
 def _fuller(catalogue: Sequence[Effect], data: Dataset, structure: Structure) -> tuple[Effect, ...]:
