@@ -88,6 +88,11 @@ def main() -> None:
     parser.add_argument("--declared", default="linear")
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
+    if not data_file().exists():
+        parser.error(
+            f"{data_file()} is missing; it is in ../shared/measured: put that beside the checkout, "
+            "or name its place in ENTRAIN_MEASURED_DATA"
+        )
     result = run(given.declared)
     print(table(result))
     if given.json is not None:
