@@ -10,7 +10,8 @@ samples a period. A free run has a free phase, fixed by Im v_0,1 = 0, and an unk
 place. Started from the measured orbit, Newton stays on the measured branch where several exist.
 
 Derivatives come from the implicit function theorem, ∂x/∂θ = −R_x⁻¹ R_θ, with R_θ by automatic
-differentiation of the assembled equations: exact, and the solver itself is never differenced.
+differentiation of the assembled equations: exact, and the solver itself is never differenced. Only
+Newton's own steps take the slopes by a free run's ω from a difference.
 """
 
 from collections.abc import Iterable, Sequence

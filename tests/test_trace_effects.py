@@ -515,9 +515,11 @@ def test_a_claim_takes_most_of_the_misfit_away(
     ("key", "parameters", "place"),
     [
         ("nonlinear_damping/cubic", {}, "forward"),
+        ("flame_delay", {"delay_s": 3e-4}, "flame"),
         ("nonlinearity_shape/quartic", {}, "nonlinearity"),
         ("nonlinear_damping/quadratic", {"quadratic_per_m": 20.0}, "forward"),
         ("actuator_dynamics/voice_coil", {}, "actuator"),
+        ("actuator_dynamics/voice_coil", {"pole_hz": 150.0}, "actuator"),
         ("actuator_nonlinearity/clipping", {}, "actuator"),
         ("channel_mismatch/gain", {}, "sensor"),
         ("sensor_offset", {"offset_m": 0.056}, "sensor"),
@@ -527,8 +529,7 @@ def test_a_claim_takes_most_of_the_misfit_away(
 def test_what_no_candidate_explains_is_placed(
     tmp_path: Path, key: str, parameters: dict[str, float], place: str
 ) -> None:
-    """A freely shaped piece takes the misfit up where it lies, and nowhere else. (A flame delay and
-    a gross voice coil: in whole diagnoses, below.)"""
+    """A freely shaped piece takes the misfit up where it lies, and nowhere else."""
     drawn = EFFECTS[key].draw(np.random.default_rng(5), 0.5)
     values = parameters or {n: float(v["value"]) for n, v in drawn.parameters().items()}
     ready = thesis_campaign(tmp_path, 7, {key: values})
