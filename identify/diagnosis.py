@@ -136,17 +136,20 @@ def diagnose(
         tried = trace.against_chance(tried, pieces())
         contesting = deviating(chosen) if chosen.spread else []
         verdict, chosen, explanation = _judge(declared, tried, data, [*pieces(), *contesting])
-    if tones and verdict in ("no_discrepancy", "traced"):
-        verdict = "traced"
-        explanation += " A foreign tone stands in the channels of most runs."
     where = None
     if verdict == "unexplained":
         asked = [*pieces(), *contesting]
         if not any(t.adequate and t.fit_p > DOUBTFUL for t in pieces()):
             asked += trace.remembering(ready.structure, data, base, run, placing)
             asked += deviating()
+            tried = trace.unrivalled(tried, asked)
+            verdict, chosen, explanation = _judge(declared, tried, data, asked)
+    if verdict == "unexplained":
         where = trace.whereabouts(asked, tried, base)
         explanation = f"{explanation} {where.words}"
+    if tones and verdict in ("no_discrepancy", "traced"):
+        verdict = "traced"
+        explanation += " A foreign tone stands in the channels of most runs."
     after = before if chosen is None else _after(chosen, data, before.noise_floor)
     before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
@@ -302,6 +305,8 @@ def _judge(
                 if open_[e.name]
             ]
             said = f"Adding {words} explains the data; no rival does."
+            if best.spread is not None and best.spread.objection:
+                said += f" No law comes near: that {best.spread.objection} is put down to luck."
             return "traced", best, said + "".join(forms)
         names = ", ".join(t.words for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."

@@ -10,7 +10,8 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_context
+from multiprocessing import get_all_start_methods, get_context
+from multiprocessing.context import BaseContext
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from threadpoolctl import threadpool_limits
@@ -85,7 +86,7 @@ def executor(processes: int = 1, dask_address: str | None = None) -> Iterator[Ex
     if count == 1:
         yield InProcess()
         return
-    with ProcessPoolExecutor(count, mp_context=get_context("spawn"), initializer=_prepare) as pool:
+    with ProcessPoolExecutor(count, mp_context=_context(), initializer=_prepare) as pool:
         for _ in range(count):  # workers start at once, beside what comes before the first map
             pool.submit(_prepare)
         try:
@@ -93,6 +94,16 @@ def executor(processes: int = 1, dask_address: str | None = None) -> Iterator[Ex
         except BaseException:  # cancelled or failed: what has not begun never begins
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _context() -> BaseContext:
+    """Workers come of a process that has loaded what they need, where there is such a thing, and
+    never of this one, which may have threads of its own."""
+    if "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload(["identify"])
+    return context
 
 
 def _prepare() -> None:

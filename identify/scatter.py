@@ -68,6 +68,8 @@ class Spread:
     sizes: dict[str, Estimate]
     penalty: float
     objection: str
+    luck: float = 1.0  # chance of what is objected to, were the deviations random; 0: not so asked
+    unrivalled: bool = False  # no law comes near (`identify.trace.selection.unrivalled`)
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,7 @@ def _alternate(
         for q, s, e in zip(scatter.parameters, sizes, errors, strict=True)
     }
     fit = _fit(structure, led, rows, sizes)
-    return Spread(fit, wide, named, _penalty(rows, sizes), _objection(rows, sizes, scatter))
+    return Spread(fit, wide, named, _penalty(rows, sizes), *_objection(rows, sizes, scatter))
 
 
 def _fit(structure: Structure, led: Led, rows: Sequence[_Rows], sizes: FloatArray) -> Fit:
@@ -333,22 +335,26 @@ def _relative_errors(rows: Sequence[_Rows], sizes: FloatArray) -> FloatArray:
     return out
 
 
-def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> str:
-    """Why the deviations are not random, in words; empty where nothing speaks against it."""
+def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> tuple[str, float]:
+    """Why the deviations are not random, in words, and how probable that is if they are; empty
+    where nothing speaks against it."""
     forced = [r for r in rows if not r.batch.free]
     x = np.concatenate([_likeliest(r, sizes) for r in forced])
     there = np.flatnonzero((sizes > 10 * SMALLEST) & (np.ptp(x, axis=0) > 0))
     names = [scatter.parameters[j].name for j in there]
     known, ranked, laws = _conditions(forced, scatter)
+    doubts: list[tuple[float, str]] = []
     for name, own in zip(names, x[:, there].T, strict=True):
         if np.max(own**2) > ONE_RUN * np.sum(own**2):
-            return f"{name}: a single run deviates"
+            return f"{name}: a single run deviates", 0.0
         for word in ranked:
             # what the parameters could have absorbed and did not, seen in the deviations themselves
-            if np.ptp(known[word]) > 0 and rank_correlation(own, known[word])[1] < TREND_P:
-                return f"{name} follows the {word}: no chance"
+            if np.ptp(known[word]) > 0:
+                p_value = rank_correlation(own, known[word])[1]
+                if p_value < TREND_P:
+                    doubts.append((p_value, f"{name} follows the {word} (p {p_value:.1g})"))
     if not there.size:
-        return NOTHING
+        return NOTHING, 0.0
     residual, jacobian = _whitened(rows, sizes)
     deviations = _forced_tangents(rows, sizes, there)
     if scatter.location == "experiment":  # what wanders follows by chance what goes with the time
@@ -356,12 +362,14 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> st
         slow = np.einsum("nmq,mk->nqk", deviations, trends).reshape(residual.size, -1)
         jacobian = np.c_[jacobian, slow]
     law = law_in(residual, jacobian, deviations, known, laws)
-    if law is None:
-        return ""
-    which = " and ".join(names[j] for j in law.directions)
-    verb = "follows" if len(law.directions) == 1 else "follow"
-    told = " and ".join(dict.fromkeys(c.removesuffix(SQUARED) for c in law.covariates))
-    return f"{which} {verb} the {told} (p {law.p_value:.1g}): no chance"
+    if law is not None:
+        which = " and ".join(names[j] for j in law.directions)
+        verb = "follows" if len(law.directions) == 1 else "follow"
+        told = " and ".join(dict.fromkeys(c.removesuffix(SQUARED) for c in law.covariates))
+        said = f"{which} {verb} the {told} (p {law.p_value:.1g})"
+        doubts.append((law.p_value, said))
+    p_value, said = min(doubts, default=(1.0, ""))
+    return said, p_value
 
 
 def _conditions(

@@ -58,6 +58,7 @@ pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the ca
 
 DRIVE = next(s for s in SCATTERS if s.name == "drive_scatter")
 FLAME = next(s for s in SCATTERS if s.name == "flame_gain_modulation")
+WALK = next(s for s in SCATTERS if s.name == "parameter_drift")
 
 
 def deviance(ready: Prepared, base: Fit, name: str) -> float:
@@ -871,6 +872,29 @@ def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
     assert best.key_of_forms == ("actuator_nonlinearity:cubic", "drive_scatter")
     a3 = best.estimates["actuator_nonlinearity.a3"]
     assert abs(a3.value + 0.02) < 4 * a3.stderr
+
+
+def test_other_forms_are_asked_beside_each_kind_of_chance(tmp_path: Path) -> None:
+    """The drive's scatter takes up whatever the drive does: beside it, the wrong form may leave
+    less than beside the frequency's walk, which is the truth."""
+    effects = {
+        "actuator_dynamics/resonance": {"resonance_hz": 800.0, "damping": 0.3},
+        "parameter_drift/frequency_walk": {"frequency_walk": 1e-3},
+    }
+    ready = thesis_campaign(tmp_path, 7, effects, noise_db=60.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    wrong, right = (by_key(f"actuator_dynamics:{form}") for form in ("pole", "resonance"))
+    lag = only(ready, base, "actuator_dynamics:pole")
+    scattered, walking = try_scatters(
+        lag.fit.structure, ready.data, lag.fit, [DRIVE, WALK], InProcess()
+    )
+    assert walking.spread is not None
+    less = replace(scattered.fit, chi2=0.5 * walking.fit.chi2)
+    refused = replace(walking.spread, objection="frequency_rms follows the frequency")
+    both = [replace(scattered, fit=less), replace(walking, spread=refused)]
+    found = _other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
+    best = trace.best_form([t for t in found if t.explains])
+    assert best.key_of_forms == ("actuator_dynamics:resonance", "parameter_drift:random")
 
 
 @pytest.mark.parametrize(

@@ -279,6 +279,29 @@ def test_a_law_may_follow_what_chance_did(excess: float, objection: str, rival: 
     assert (trace.rivals(law, [law, chance]) == [chance]) is rival
 
 
+@pytest.mark.parametrize(
+    ("left", "luck", "claimed"),
+    [
+        (400.0, 1e-3, True),  # no law comes near, and so many are asked
+        (200.0, 1e-3, False),  # this one would, were it quite right
+        (400.0, 1e-5, False),  # no luck, whatever laws are known
+        (400.0, 0.0, False),
+    ],
+)
+def test_what_speaks_against_a_spread_may_be_luck(left: float, luck: float, claimed: bool) -> None:
+    chance = spread_of(900.0, "gain_rms follows the drive")
+    assert chance.spread is not None
+    chance = replace(chance, spread=replace(chance.spread, luck=luck))
+    hardly = replace(chance, fit_p=0.01)
+    law, shape = tried_as(fitted(1, 500.0), "flame_delay"), tried_as(fitted(2, left))
+    assert chance.objection
+    assert not hardly.leaves_noise
+    one, other, same = trace.unrivalled([chance, hardly, law], [shape])
+    assert (not one.objection) is claimed
+    assert other.leaves_noise is (left > 300.0)
+    assert same is law
+
+
 @pytest.mark.parametrize("form", ["tanh_gain", "arctan_gain", "quadratic_odd"])
 def test_characteristics_and_their_derivatives(form: str) -> None:
     effect = by_key(f"nonlinearity_shape:{form}")

@@ -17,7 +17,9 @@
    well, complexity counted (`tried`), nor, where it leaves more than noise mostly does, a freely
    shaped piece that is far likelier; a spread, no spread at another place.
 5. Where nothing explains the data, freely shaped pieces and the single effects say where in the
-   loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`).
+   loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`). Where
+   none of all these but a spread comes near, that one is claimed though it looks a little less
+   random than most: with no law to hide, it is (`selection.unrivalled`).
 """
 
 from identify.trace.places import deviating, remembering, shaped, whereabouts
@@ -27,6 +29,7 @@ from identify.trace.selection import (
     against_chance,
     refitted,
     search,
+    unrivalled,
     without_effects,
 )
 from identify.trace.stages import started_again, try_effects, usable
@@ -70,6 +73,7 @@ __all__ = [
     "shaped",
     "started_again",
     "try_effects",
+    "unrivalled",
     "usable",
     "whereabouts",
     "without_effects",

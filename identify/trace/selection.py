@@ -48,6 +48,7 @@ from identify.trace.tried import (
     astray,
     best_by_name,
     best_form,
+    best_of_each_form,
     first_of_each,
     foremost,
     misfit,
@@ -59,7 +60,8 @@ Progress = Callable[[float, str], None]
 BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 #: Shares of each coefficient that count as noise, to see what is greatest: chance, or a law.
 CHANCE_SOFTENED, LAW_SOFTENED = (0.001, 0.005, 0.02), (0.005, 0.02)
-FOREMOST = 2  # laws seen there beside which chance is tried
+FOREMOST, FORMS = 2, 4  # laws seen there beside which chance is tried, and forms of each …
+ALIKE = 1.05  # … that leave no more than so many times the least
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought, and chance, from afar
 STANDS_OUT = 30.0  # times less misfit than with any other effect
@@ -168,6 +170,12 @@ class _Searching:
     @property
     def explained(self) -> bool:
         return any(t.explains for t in self.tried)
+
+    @property
+    def accounted(self) -> bool:
+        """Whether something explains the data that the misfit goes with, so that it may be said."""
+        declared = tried((), self.base, self.data)
+        return any(t.explains and accounts(t, declared, self.tried) for t in self.tried)
 
     @property
     def by_chance(self) -> bool:
@@ -302,10 +310,10 @@ class _Searching:
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
                         seek(soft, base)
-        if not self.explained:
+        if not self.accounted:
             found = _other_forms_beside_chance(self.tried, data, self.apart, run)
             self._add_beside_chance(found)
-        if not self.explained:
+        if not self.accounted:
             self.tried += _in_the_place_of_chance(self.tried, data, self.apart, run)
 
     def _chance_from_softened(self, soft: Dataset, base: Fit) -> None:
@@ -324,8 +332,11 @@ class _Searching:
             far=astray(base), progress=lambda done, text: None,
         )  # fmt: skip
         found = []
-        for t in best_by_name(laws)[:FOREMOST]:
-            found += self._scattered(t.fit.structure, t.fit)
+        for best in best_by_name(laws)[:FOREMOST]:
+            # forms that coarse noise does not tell apart, the noise itself may
+            forms = [t for t in best_of_each_form(laws) if t.key == best.key]
+            for t in [t for t in forms if misfit(t) < ALIKE * misfit(best)][:FORMS]:
+                found += self._scattered(t.fit.structure, t.fit)
         found += _simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
 
@@ -362,10 +373,8 @@ class _Searching:
             certain = [t for t in self.tried if t.spread is None]
             self.tried += reformed(certain, self.data, self.forms, self.run, self.done)
         self._contest()
-        declared = tried((), self.base, self.data)
-        claimed = any(t.explains and accounts(t, declared, self.tried) for t in self.tried)
         first = foremost([t for t in self.tried if t.spread is None and t.plausible])
-        if self.explained and not claimed and first is not None and not first.explains:
+        if self.explained and not self.accounted and first is not None and not first.explains:
             self.report(0.95, "trying other forms of the foremost")
             others = reformed([first], self.data, self.forms, self.run, self.done)
             self.tried += others
@@ -414,11 +423,29 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
     out = []
     for t in tries:
         if t.spread is not None and t.evidence > least:
-            spread = replace(t.spread, objection=t.spread.objection or BEATEN)
+            spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
             out.append(replace(t, spread=spread))
         else:
             out.append(t)
     return out
+
+
+def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
+    """Spreads alone are marked where no law comes near the data: none of `tries`, and none of the
+    freely shaped `pieces`, which may follow the runs' conditions however they like.
+
+    There is then no law that a spread could hide, and what speaks against it by a small chance
+    alone (`tried.LUCK`) is what so many questions bring about now and then.
+    """
+    laws = [t.fit.chi2_per_dof for t in (*tries, *pieces) if t.spread is None]
+    if min(laws, default=0.0) <= NO_CHANCE:
+        return list(tries)
+    return [
+        replace(t, spread=replace(t.spread, unrivalled=True))
+        if t.spread is not None and len(t.effects) == 1
+        else t
+        for t in tries
+    ]
 
 
 def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
@@ -472,14 +499,18 @@ def _simpler_beside_chance(
 def _other_forms_beside_chance(
     tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
 ) -> list[Tried]:
-    """The other forms of the law that comes nearest to the noise with a spread beside it, where
-    none explains the data: a spread that looks like no chance may follow what its form lacks."""
-    both = [t for t in tries if t.spread and len(t.effects) == 2]
-    best = min(both, key=lambda t: (not t.adequate, misfit(t)), default=None)
-    if best is None or best.fit.chi2_per_dof > LITTLE:
-        return []
-    found = _in_forms_beside_chance(best, data, available, run)
-    return [*found, *_simpler_beside_chance(found, data, available, run)]
+    """The other forms of the law that comes nearest to the noise beside each kind of chance, where
+    none explains the data: a spread that looks like no chance may follow what its form lacks. The
+    kind that takes up most leaves least whatever the law is: each is asked."""
+    near = [t for t in tries if t.spread and len(t.effects) == 2 and t.fit.chi2_per_dof < LITTLE]
+    near.sort(key=lambda t: (not t.adequate, misfit(t)))
+    out: list[Tried] = []
+    for t in first_of_each(near, lambda t: t.effects[-1].key).values():
+        found = _in_forms_beside_chance(t, data, available, run)
+        out += [*found, *_simpler_beside_chance(found, data, available, run)]
+        if any(o.explains for o in out):
+            break
+    return out
 
 
 def _in_forms_beside_chance(

@@ -42,6 +42,7 @@ REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothin
 SURELY = 4  # so many are refitted in any case
 PROMISED = 0.4  # share of χ² that a small effect would take away: refitted straight from the base
 OF_MODES = 48  # starts of one more mode, which may be anywhere and of either sign
+RIVAL_FORMS = 2  # of an effect that are led in from afar where another explains the data
 SHAPES = 4  # so many are started from of an effect whose shape is unknown
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 NO_RIVAL = 30.0  # times what noise leaves: what promises no less is none of what explains the data
@@ -335,10 +336,15 @@ def try_effects(
     if far and not (near and any(t.adequate for t in out)):  # it may have been too flexible
         placements = likely_placements(replace(structure, effects=()), rough)
         tasks = [replace(t, placements=placements) for t in tasks]
-        for i, starts in enumerate(executor.map(_from_afar, tasks)):
+        led: Sequence[int] = range(len(tasks))
+        if any(t.explains for t in out):  # the others are its rivals, for which two forms speak
+            led = _first_forms(staged)
+        for done, (i, starts) in enumerate(
+            zip(led, executor.map(_from_afar, [tasks[i] for i in led]), strict=True), start=1
+        ):
             both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
             staged[i] = (tasks[i], both)
-            progress(0.3 + (i + 1) / len(tasks) * 0.2, f"trying {tasks[i].effect.key} from afar")
+            progress(0.3 + done / len(led) * 0.2, f"trying {tasks[i].effect.key} from afar")
         out += _refits(staged, out, data, executor, keep, progress)
     return sorted(out, key=misfit)
 
@@ -454,6 +460,17 @@ def _best(
         if same < forms:
             out.append(item)
     return out[:keep]
+
+
+def _first_forms(staged: Sequence[tuple[_Task, list[CoarseStart]]]) -> list[int]:
+    """Which are the most promising forms of each effect, two of each."""
+    costs = [starts[0].cost if starts else np.inf for _, starts in staged]
+    out = list[int]()
+    for i in sorted(range(len(staged)), key=lambda i: costs[i]):
+        name = staged[i][0].effect.name
+        if sum(staged[j][0].effect.name == name for j in out) < RIVAL_FORMS:
+            out.append(i)
+    return out
 
 
 def _heats(

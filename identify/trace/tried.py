@@ -31,6 +31,7 @@ VISIBLE = 10.0  # … of so much χ²/dof
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
 LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws leaves less by chance
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
+LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
 ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
@@ -95,8 +96,16 @@ class Tried:
     @property
     def leaves_noise(self) -> bool:
         """Whether what is left beside a spread, if there is one, is as probable as it must be."""
-        least = LEFT_P if len(self.effects) == 1 else LEFT_BESIDE_P
-        return self.spread is None or self.fit_p > least
+        if self.spread is None or self.spread.unrivalled:
+            return True
+        return self.fit_p > (LEFT_P if len(self.effects) == 1 else LEFT_BESIDE_P)
+
+    @property
+    def objection(self) -> str:
+        """What speaks against its spread, if it has one."""
+        if self.spread is None or (self.spread.unrivalled and self.spread.luck > LUCK):
+            return ""
+        return self.spread.objection
 
     @property
     def deviance(self) -> float:
@@ -131,7 +140,7 @@ class Tried:
 
     @property
     def plausible(self) -> bool:
-        if self.spread is not None and self.spread.objection:
+        if self.objection:
             return False
         known = self.estimates
         values = {name: e.value for name, e in known.items()}
@@ -261,7 +270,7 @@ def _chance_rivals(spread: Tried, best: Tried) -> bool:
         return False
     if best.spread is not None:
         return spread.plausible and (spread.adequate or len(spread.effects) == 1)
-    random = spread.spread.objection in ("", BEATEN)
+    random = spread.objection in ("", BEATEN)
     return spread.adequate and spread.evidence < best.evidence + (EVIDENCE if random else 0.0)
 
 
@@ -355,4 +364,4 @@ def _note(t: Tried) -> str:
     if t.spread is None:
         return ""
     left = "leaves more than noise" if t.adequate and not t.leaves_noise else ""
-    return t.spread.objection or left
+    return t.objection or left
