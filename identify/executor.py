@@ -7,10 +7,11 @@ function with picklable arguments.
 import functools
 import importlib
 import os
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import get_all_start_methods, get_context
+from multiprocessing import get_all_start_methods, get_context, parent_process
 from multiprocessing.context import BaseContext
 from typing import Any, ParamSpec, Protocol, TypeVar
 
@@ -88,7 +89,7 @@ def executor(processes: int = 1, dask_address: str | None = None) -> Iterator[Ex
         return
     with ProcessPoolExecutor(count, mp_context=_context(), initializer=_prepare) as pool:
         for _ in range(count):  # workers start at once, beside what comes before the first map
-            pool.submit(_prepare)
+            pool.submit(os.getpid)
         try:
             yield _Pool(pool)
         except BaseException:  # cancelled or failed: what has not begun never begins
@@ -110,3 +111,12 @@ def _prepare() -> None:
     """What every worker needs first."""
     importlib.import_module("identify")
     threadpool_limits(limits=1, user_api="blas")
+    threading.Thread(target=_end_with_the_parent, daemon=True).start()
+
+
+def _end_with_the_parent() -> None:
+    """A worker whose process was killed would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
