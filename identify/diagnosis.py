@@ -142,7 +142,7 @@ def diagnose(
         if not any(t.adequate and t.fit_p > DOUBTFUL for t in pieces()):
             asked += trace.remembering(ready.structure, data, base, run, placing)
             asked += deviating()
-            tried = trace.unrivalled(tried, asked)
+            tried, asked = trace.unrivalled(tried, asked), trace.unrivalled(asked, tried)
             verdict, chosen, explanation = _judge(declared, tried, data, asked)
     if verdict == "unexplained":
         where = trace.whereabouts(asked, tried, base)
