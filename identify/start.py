@@ -266,12 +266,16 @@ def candidates(structure: Structure, data: Dataset, keep: int = 4) -> Iterator[F
 
 
 def _near(structure: Structure, a: FloatArray, b: FloatArray) -> bool:
-    """Whether two starts have the same poles to within 3 % (frequencies) and 30 % (the rest)."""
-    for p, u, v in zip(structure.parameters.parameters, a, b, strict=True):
+    """Whether two starts have the same poles to within 3 % (frequencies) and 30 % (the rest), and
+    their effects' signed parameters to within 30 %."""
+    plain = len(structure.base_parameters)
+    for i, (p, u, v) in enumerate(zip(structure.parameters.parameters, a, b, strict=True)):
         if p.kind == "positive":
             limit = 0.03 if p.name.endswith("frequency_hz") else 0.3
-            if abs(u - v) > limit:
-                return False
+        else:
+            limit = np.inf if i < plain else 0.3 * max(abs(u), abs(v))
+        if abs(u - v) > limit:
+            return False
     return True
 
 
@@ -502,6 +506,15 @@ def polish(
     return sorted((c for c in found if np.isfinite(c.cost)), key=lambda c: c.cost)
 
 
+def distinct(structure: Structure, starts: Sequence[CoarseStart]) -> list[CoarseStart]:
+    """Of sorted starts those that are not near one before them."""
+    out: list[CoarseStart] = []
+    for start in starts:
+        if not any(_near(structure, start.theta, other.theta) for other in out):
+            out.append(start)
+    return out
+
+
 def _placements(count: int) -> list[tuple[float, ...]]:
     """Assumed frequencies of the other modes over the singing one's: from a closed-open tube's
     odd ratios, an open or closed tube's whole ones, and in between."""
@@ -662,10 +675,6 @@ def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) ->
     polished = polish(structure, rough, starts[:DENSE])
     if not polished:
         return []
-    distinct: list[FloatArray] = []
-    for candidate in polished:
-        if not any(_near(structure, candidate.theta, other) for other in distinct):
-            distinct.append(candidate.theta)
-    chosen = np.stack(distinct[:8])
+    chosen = np.stack([s.theta for s in distinct(structure, polished)[:8]])
     worse, steps = no_better(near, data), (0.003, 0.0)
     return [fit_orbits(structure, data, chosen, continuation=steps, iterations=120, hopeless=worse)]

@@ -25,6 +25,7 @@ from identify.start import (
     coarse,
     corrected,
     dense_placements,
+    distinct,
     every_start,
     fit_from_data,
     physical_starts,
@@ -33,7 +34,7 @@ from identify.start import (
 )
 from identify.structure import Effect, Known, Structure
 from identify.trace.scores import ScoreTest, scan, score_tests
-from identify.trace.tried import Tried, best_by_name, misfit, tried
+from identify.trace.tried import Tried, best_by_name, first_of_each, misfit, tried
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -43,6 +44,7 @@ SURELY = 4  # so many are refitted in any case
 PROMISED = 0.4  # share of χ² that a small effect would take away: refitted straight from the base
 OF_MODES = 48  # starts of one more mode, which may be anywhere and of either sign
 RIVAL_FORMS = 2  # of an effect that are led in from afar where another explains the data
+OWN = 6  # starting values of an effect that are all led in from afar
 SHAPES = 4  # so many are started from of an effect whose shape is unknown
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 NO_RIVAL = 30.0  # times what noise leaves: what promises no less is none of what explains the data
@@ -159,14 +161,18 @@ def _from_afar(task: _Task) -> list[CoarseStart]:
     larger = task.structure.with_effects(task.effect)
     inherited = [task.base.values[q.name] for e in task.structure.effects for q in e.parameters]
     rows = [[*inherited, *row] for row in task.proposals]
-    starts = physical_starts(larger, task.rough, rows, task.placements)[:4]
+    every = physical_starts(larger, task.rough, rows, task.placements)
+    # the best, and the best of each of the effect's own: coarse noise tells those apart badly
+    inner = len(task.base.theta)
+    of_each = first_of_each(every, lambda s: s.theta[inner:].tobytes())
+    starts = list({id(s): s for s in [*every[:4], *list(of_each.values())[:OWN]]}.values())
     if task.richer is not None:  # of another mode: anywhere, and of either sign
         dense = dense_placements(task.richer.mode_count - 1)
         signed = signed_starts(task.richer, task.rough, placements=dense)[:OF_MODES]
         found = polish(task.richer, task.rough, signed, (ROUGH,), 6)[:2]
         same = renamed(task.effect, larger, task.richer, [s.theta for s in found])
         starts += coarse(larger, task.rough, same)
-    led = polish(larger, task.rough, starts, (ROUGH,), 8)[:3]
+    led = distinct(larger, polish(larger, task.rough, starts, (ROUGH,), 8))[:3]
     return polish(larger, task.seen, led, (task.shares[0],), 8)[:3]
 
 
