@@ -231,3 +231,20 @@ def test_a_strong_side_resonator_of_a_tube_with_one_mode(tmp_path: Path) -> None
     assert found.explains
     frequency = found.estimates["acoustic_mode.frequency_hz"]
     assert abs(frequency.value - 268.0) < 4 * frequency.stderr
+
+
+def test_a_resonator_beside_the_singing_mode_at_its_own_frequency(tmp_path: Path) -> None:
+    """From afar the start above that frequency looks best, and leads to one that gives energy."""
+    size = {"frequency_hz": 144.08, "damping": 0.0484, "coupling": 0.00112}
+    branch = make_effect("side_resonator", size)
+    rig = random_rig(19028, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    ready = record(tmp_path, 19028, rig, [branch], forced=9, validation=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert base.chi2_per_dof > 1000
+    best = only(ready, base, "acoustic_mode:side_resonator_mode")
+    assert best.explains
+    frequency = best.estimates["acoustic_mode.frequency_hz"]
+    assert abs(frequency.value - 144.08) < 4 * frequency.stderr
+    giving = best.fit.theta.copy()
+    giving[best.fit.structure.parameters.index["acoustic_mode.coupling1"]] *= -1
+    assert not replace(best, fit=replace(best.fit, theta=giving)).plausible
