@@ -164,8 +164,9 @@ def _from_afar(task: _Task) -> list[CoarseStart]:
     every = physical_starts(larger, task.rough, rows, task.placements)
     # the best, and the best of each of the effect's own: coarse noise tells those apart badly
     inner = len(task.base.theta)
-    of_each = first_of_each(every, lambda s: s.theta[inner:].tobytes())
-    starts = list({id(s): s for s in [*every[:4], *list(of_each.values())[:OWN]]}.values())
+    of_each = list(first_of_each(every, lambda s: s.theta[inner:].tobytes()).values())
+    starts = every[:4]
+    starts += [s for s in of_each[:OWN] if not any(s is other for other in starts)]
     if task.richer is not None:  # of another mode: anywhere, and of either sign
         dense = dense_placements(task.richer.mode_count - 1)
         signed = signed_starts(task.richer, task.rough, placements=dense)[:OF_MODES]
