@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.parameters import Parameter
+from identify.parameters import Estimate, Parameter
 from identify.polynomial import Polynomial
 from identify.structure import (
     MODAL,
@@ -22,6 +22,8 @@ from identify.structure import (
     declared_modes,
     resonance,
 )
+
+SURE = 3.0  # standard errors that a value must lie off zero, for its sign to speak
 
 
 class AcousticMode(Effect):
@@ -171,6 +173,18 @@ class SideResonator(Effect):
         sizes = ((share * size.real * q).tolist() for share in (1.0, 0.1))
         rows = [(f, zeta, *load, *q[1:].tolist()) for load in sizes]
         return rows if np.isfinite(rows).all() else []
+
+    def impossible(self, known: Mapping[str, Estimate]) -> bool:
+        """It takes energy from every mode, as from mode 1: κ_i q_i is never negative."""
+        others = range(2, self.count + 1)
+        pairs = [
+            (known[f"acoustic_mode.coupling{i}"], known[f"acoustic_mode.mouth_ratio{i}"])
+            for i in others
+        ]
+        return any(
+            k.value * q.value < 0 and all(abs(e.value) > SURE * e.stderr for e in (k, q))
+            for k, q in pairs
+        )
 
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
         f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]
