@@ -130,9 +130,10 @@ class SideResonator(Effect):
             Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
             Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
             # it takes energy from mode 1, never gives: κ_1 q_1 > 0
+            Parameter("acoustic_mode.coupling1", "1", 0.0, 1.0, scale=1e-3),
             *(
-                Parameter(f"acoustic_mode.coupling{i}", "1", -1.0 * (i > 1), 1.0, scale=1e-3)
-                for i in each
+                Parameter(f"acoustic_mode.coupling{i}", "1", -1.0, 1.0, scale=1e-3)
+                for i in each[1:]
             ),
             *(Parameter(f"acoustic_mode.mouth_ratio{i}", "1") for i in each[1:]),
         )

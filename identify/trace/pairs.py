@@ -18,7 +18,7 @@ from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Effect, Known, Structure
 from identify.trace.stages import OF_MODES, canonical, known_sizes, likely_placements, renamed
-from identify.trace.tried import Tried, tried
+from identify.trace.tried import Tried, few_of_each, tried
 
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
 SIDE_BY_SIDE = 16  # starts of a pair without a further mode that are led on
@@ -164,10 +164,5 @@ def _refit(led: _Led) -> Fit:
 
 def _best(led: Sequence[_Led], count: int) -> list[_Led]:
     """Those that came nearest, no more than two of the same effects."""
-    out: list[_Led] = []
-    for found in sorted((f for f in led if f.starts), key=lambda f: f.starts[0].cost):
-        names = {e.name for e in found.pair.effects}
-        same = sum({e.name for e in o.pair.effects} == names for o in out)
-        if same < 2:
-            out.append(found)
-    return out[:count]
+    ranked = sorted((f for f in led if f.starts), key=lambda f: f.starts[0].cost)
+    return few_of_each(ranked, lambda f: frozenset(e.name for e in f.pair.effects), 2)[:count]

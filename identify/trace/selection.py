@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -174,8 +174,11 @@ class _Searching:
     @property
     def accounted(self) -> bool:
         """Whether something explains the data that the misfit goes with, so that it may be said."""
-        declared = tried((), self.base, self.data)
-        return any(t.explains and accounts(t, declared, self.tried) for t in self.tried)
+        return any(t.explains and accounts(t, self.declared, self.tried) for t in self.tried)
+
+    @cached_property
+    def declared(self) -> Tried:
+        return tried((), self.base, self.data)
 
     @property
     def by_chance(self) -> bool:
@@ -332,10 +335,11 @@ class _Searching:
             far=astray(base), progress=lambda done, text: None,
         )  # fmt: skip
         found = []
+        forms = best_of_each_form(laws)
         for best in best_by_name(laws)[:FOREMOST]:
-            # forms that coarse noise does not tell apart, the noise itself may
-            forms = [t for t in best_of_each_form(laws) if t.key == best.key]
-            for t in [t for t in forms if misfit(t) < ALIKE * misfit(best)][:FORMS]:
+            # what coarse noise does not tell apart, the noise itself may
+            most = ALIKE * misfit(best)
+            for t in [t for t in forms if t.key == best.key and misfit(t) < most][:FORMS]:
                 found += self._scattered(t.fit.structure, t.fit)
         found += _simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)

@@ -34,7 +34,7 @@ from identify.start import (
 )
 from identify.structure import Effect, Known, Structure
 from identify.trace.scores import ScoreTest, scan, score_tests
-from identify.trace.tried import Tried, best_by_name, first_of_each, misfit, tried
+from identify.trace.tried import Tried, best_by_name, few_of_each, first_of_each, misfit, tried
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -211,12 +211,9 @@ def _promising(
     """The effects that promise most of the misfit, no more than two forms of one."""
     sure = [t for t in tasks if t.base.converged]
     promised = zip(sure, executor.map(_promise, sure), strict=True)
-    out: list[tuple[_Task, list[FloatArray]]] = []
-    for task, (drop, rows) in sorted(promised, key=lambda item: -item[1][0]):
-        same = sum(o.effect.name == task.effect.name for o, _ in out)
-        if drop > PROMISED * task.base.chi2 and same < 2:
-            out.append((task, rows))
-    return out[:keep]
+    ranked = sorted(promised, key=lambda item: -item[1][0])
+    most = [(t, rows) for t, (drop, rows) in ranked if drop > PROMISED * t.base.chi2]
+    return few_of_each(most, lambda item: item[0].effect.name, 2)[:keep]
 
 
 def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
@@ -343,9 +340,10 @@ def try_effects(
     if far and not (near and any(t.adequate for t in out)):  # it may have been too flexible
         placements = likely_placements(replace(structure, effects=()), rough)
         tasks = [replace(t, placements=placements) for t in tasks]
-        led: Sequence[int] = range(len(tasks))
+        led = list(range(len(tasks)))
         if any(t.explains for t in out):  # the others are its rivals, for which two forms speak
-            led = _first_forms(staged)
+            led.sort(key=lambda i: min((s.cost for s in staged[i][1]), default=np.inf))
+            led = few_of_each(led, lambda i: tasks[i].effect.name, RIVAL_FORMS)
         for done, (i, starts) in enumerate(
             zip(led, executor.map(_from_afar, [tasks[i] for i in led]), strict=True), start=1
         ):
@@ -461,23 +459,8 @@ def _best(
     staged: Sequence[tuple[_Task, list[CoarseStart]]], keep: int, forms: int
 ) -> list[tuple[_Task, list[CoarseStart]]]:
     """The `keep` most promising, no more than `forms` of one effect."""
-    out: list[tuple[_Task, list[CoarseStart]]] = []
-    for item in sorted((s for s in staged if s[1]), key=lambda s: s[1][0].cost):
-        same = sum(o[0].effect.name == item[0].effect.name for o in out)
-        if same < forms:
-            out.append(item)
-    return out[:keep]
-
-
-def _first_forms(staged: Sequence[tuple[_Task, list[CoarseStart]]]) -> list[int]:
-    """Which are the most promising forms of each effect, two of each."""
-    costs = [starts[0].cost if starts else np.inf for _, starts in staged]
-    out = list[int]()
-    for i in sorted(range(len(staged)), key=lambda i: costs[i]):
-        name = staged[i][0].effect.name
-        if sum(staged[j][0].effect.name == name for j in out) < RIVAL_FORMS:
-            out.append(i)
-    return out
+    ranked = sorted((s for s in staged if s[1]), key=lambda s: s[1][0].cost)
+    return few_of_each(ranked, lambda s: s[0].effect.name, forms)[:keep]
 
 
 def _heats(

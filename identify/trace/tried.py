@@ -4,6 +4,7 @@ Selection is by lack of fit and held-out runs with corrected significance; infor
 only weigh candidates that are adequate already: χ² + p ln n, within 10 of the best.
 """
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -198,6 +199,17 @@ def first_of_each(items: Iterable[T], kind: Callable[[T], K]) -> dict[K, T]:
     for item in items:
         first.setdefault(kind(item), item)
     return first
+
+
+def few_of_each(items: Iterable[T], kind: Callable[[T], Hashable], most: int) -> list[T]:
+    """The first `most` items of each kind, in their order."""
+    seen: Counter[Hashable] = Counter()
+    out = []
+    for item in items:
+        seen[kind(item)] += 1
+        if seen[kind(item)] <= most:
+            out.append(item)
+    return out
 
 
 def misfit(t: Tried) -> float:
