@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from identify.parameters import Estimate, Parameter
+from identify.parameters import Parameter
 from identify.polynomial import Polynomial
 from identify.structure import (
     MODAL,
@@ -22,8 +22,6 @@ from identify.structure import (
     declared_modes,
     resonance,
 )
-
-SURE = 3.0  # standard errors that a value must lie off zero, for its sign to speak
 
 
 class AcousticMode(Effect):
@@ -112,11 +110,13 @@ def _mode_parameters(which: str) -> tuple[Parameter, ...]:
 class SideResonator(Effect):
     """A resonator beside the tube, a Helmholtz resonator or a plenum, coupled to `modes` modes.
 
-    y'' + 2ζω y' + ω² y = ω² Σ q_i η_i, with the displacements η_i at its mouth, and it pushes back
-    on mode i by −κ_i y''. So κ_i ω² s/(s² + 2ζωs + ω²) loads the velocity there; q_1 = 1, so that
-    near a node of mode 1 the others have no bound.
+    y'' + 2ζω y' + ω² y = ω² Σ h_i η_i, with the displacements η_i at its mouth, and it pushes back
+    on mode i by −g_i h_i y'', g_1 = 1. So g_i h_i ω² s/(s² + 2ζωs + ω²) loads the velocity there.
+    Of a mode that has a node at the mouth it feels nothing and gives nothing back, h_i = 0; and it
+    takes energy from every mode, never gives, g_i > 0.
     Other than one more mode, it moves the poles of the others, and its residues have phases.
-    Beside the singing mode the load on that one alone is most of it: ``side_resonator_mode``.
+    Beside the singing mode the load on that one alone, κ = h_1², is most of it:
+    ``side_resonator_mode``.
     """
 
     name, location = "acoustic_mode", "forward"
@@ -126,23 +126,29 @@ class SideResonator(Effect):
         self.mode_count, self.count = modes, modes or 1
         self.refines = modes is not None
         each = range(1, self.count + 1)
-        self.parameters = (
+        own = (
             Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
             Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
-            # it takes energy from mode 1, never gives: κ_1 q_1 > 0
-            Parameter("acoustic_mode.coupling1", "1", 0.0, 1.0, scale=1e-3),
-            *(
-                Parameter(f"acoustic_mode.coupling{i}", "1", -1.0, 1.0, scale=1e-3)
-                for i in each[1:]
-            ),
-            *(Parameter(f"acoustic_mode.mouth_ratio{i}", "1") for i in each[1:]),
+        )
+        self.parameters = (
+            (*own, Parameter("acoustic_mode.coupling", "1", 0.0, 1.0, scale=1e-3))
+            if modes is None
+            else (
+                *own,
+                *(Parameter(f"acoustic_mode.mouth{i}", "1", -3.0, 3.0, scale=0.03) for i in each),
+                *(
+                    Parameter(f"acoustic_mode.return_ratio{i}", "1", 1e-4, 1e4, "positive")
+                    for i in each[1:]
+                ),
+            )
         )
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        ones = (1.0,) * (self.count - 1)
-        places = (0.8, 1.3, 1.9) if self.refines else (0.8, 0.9, 1.05, 1.15, 1.4)
-        size = 3e-3 if self.refines else 1e-3
-        return [(q * known.free_hz, 0.04, *(size,) * self.count, *ones) for q in places]
+        if self.refines:
+            felt = (0.055,) * self.count
+            ones = (1.0,) * (self.count - 1)
+            return [(q * known.free_hz, 0.04, *felt, *ones) for q in (0.8, 1.3, 1.9)]
+        return [(q * known.free_hz, 0.04, 1e-3) for q in (0.8, 0.9, 1.05, 1.15, 1.4)]
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         if self.refines:
@@ -152,11 +158,12 @@ class SideResonator(Effect):
 
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
         """From one more mode: at its frequency the load takes the place of its residues, so that
-        r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise; κ_i is taken to go as q_i. From
-        mode 1 alone to all."""
+        r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise, with κ_i = κ_1 q_i taken for the
+        g_i h_i. From mode 1 alone to all."""
         if isinstance(other, SideResonator) and self.refines:
-            none = (0.0,) * (self.count - 1)
-            return [(*(values[q.name] for q in other.parameters), *none, *none)]
+            f, zeta, coupling = (values[q.name] for q in other.parameters)
+            none, ones = (0.0,) * (self.count - 1), (1.0,) * (self.count - 1)
+            return [(f, zeta, np.sqrt(max(coupling, 0.0)), *none, *ones)]
         if not isinstance(other, AcousticMode) or other.more > 1:
             return []
         f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
@@ -170,32 +177,28 @@ class SideResonator(Effect):
         if self.count > 1 and np.all(part[1:] != 0):
             q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
         size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
+        rows = []
         # a strong one has moved the modes: from a tenth of the load they are brought there
-        sizes = ((share * size.real * q).tolist() for share in (1.0, 0.1))
-        rows = [(f, zeta, *load, *q[1:].tolist()) for load in sizes]
+        for load in (size.real, 0.1 * size.real):
+            if self.refines:
+                rows.append((f, zeta, *(np.sqrt(abs(load)) * q), *(1.0,) * (self.count - 1)))
+            else:
+                rows.append((f, zeta, load))
         return rows if np.isfinite(rows).all() else []
-
-    def impossible(self, known: Mapping[str, Estimate]) -> bool:
-        """It takes energy from every mode, as from mode 1: κ_i q_i is never negative."""
-        others = range(2, self.count + 1)
-        pairs = [
-            (known[f"acoustic_mode.coupling{i}"], known[f"acoustic_mode.mouth_ratio{i}"])
-            for i in others
-        ]
-        return any(
-            k.value * q.value < 0 and all(abs(e.value) > SURE * e.stderr for e in (k, q))
-            for k, q in pairs
-        )
 
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
         f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]
         w = 2 * np.pi * f
-        values = [p[q.name] for q in self.parameters[2:]]
+        own = [p[q.name] for q in self.parameters[2:]]
+        felt, ratios = own[: self.count], own[self.count :]
+        returned = [felt[0], *(g * h for g, h in zip(ratios, felt[1:], strict=True))]
+        if not self.refines:
+            felt = [1.0]  # κ whole in what comes back
         none = [0.0] * (len(modes) - self.count)  # modes of another effect
         return Branch(
             impedance=resonance(Mode(f, zeta, 0.0, 0.0), s) * (w * w),
-            felt=[1.0, *values[self.count :], *none],
-            returned=[*values[: self.count], *none],
+            felt=[*felt, *none],
+            returned=[*returned, *none],
         )
 
 
