@@ -13,7 +13,6 @@ from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.identification import prepare
-from identify.parameters import Estimate
 from identify.scatter import fit_scatter
 from identify.trace.contests import in_each_form, in_their_places, joins, matched, reformed
 from identify.trace.tried import tried

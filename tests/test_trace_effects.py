@@ -246,15 +246,25 @@ def test_what_would_be_claimed_is_tried_without_its_effect(tmp_path: Path) -> No
     assert found.chi2 == pytest.approx(base.chi2, abs=1e-3)
 
 
-def test_a_noisy_record_of_the_drive_is_no_discovery(tmp_path: Path) -> None:
+def test_a_noisy_record_of_the_drive_is_no_discovery(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Noise of 0.1 V on the recorded drive: far above what the velocity's own noise explains."""
     clean = campaign(tmp_path / "clean", 2, "", drive_noise_v=0.1)
     assert identify.diagnose(clean).verdict == "no_discrepancy"
     late = campaign(tmp_path / "late", 2, "flame_delay", drive_noise_v=0.1, delay_s=6e-4)
-    rivals = [e for e in CATALOGUE if e.location in ("flame", "sensor")]
-    found = identify.diagnose(late, catalogue=rivals)
+    rivals = (
+        "flame_delay",
+        "flame_dynamics:pole",
+        "channel_mismatch:skew",
+        "drive_pickup:velocity",
+    )
+    found = identify.diagnose(late, catalogue=[by_key(k) for k in rivals])
     assert [e.effect for e in found.effects] == ["flame_delay"]
     # where nothing explains the data the best fit passes the noise on, in place of the declared one
+    # where in the loop the rest lies takes longest, and is not asked here
+    for asked in ("trace.shaped", "trace.remembering", "trace.deviating", "trace.selection.shaped"):
+        monkeypatch.setattr(f"identify.{asked}", lambda *args, **kwargs: [])
     poor = identify.diagnose(late, catalogue=[by_key("channel_mismatch:phase")])
     assert poor.verdict == "unexplained"
     assert poor.noise_floor == pytest.approx(found.noise_floor, rel=0.1)
@@ -519,12 +529,19 @@ def test_a_claim_takes_most_of_the_misfit_away(
         ("nonlinear_damping/cubic", {}, "forward"),
         ("flame_delay", {"delay_s": 3e-4}, "flame"),
         ("nonlinearity_shape/quartic", {}, "nonlinearity"),
-        ("nonlinear_damping/quadratic", {"quadratic_per_m": 20.0}, "forward"),
+        pytest.param(
+            "nonlinear_damping/quadratic",
+            {"quadratic_per_m": 20.0},
+            "forward",
+            marks=pytest.mark.slow,
+        ),
         ("actuator_dynamics/voice_coil", {}, "actuator"),
-        ("actuator_dynamics/voice_coil", {"pole_hz": 150.0}, "actuator"),
+        pytest.param(
+            "actuator_dynamics/voice_coil", {"pole_hz": 150.0}, "actuator", marks=pytest.mark.slow
+        ),
         ("actuator_nonlinearity/clipping", {}, "actuator"),
         ("channel_mismatch/gain", {}, "sensor"),
-        ("sensor_offset", {"offset_m": 0.056}, "sensor"),
+        pytest.param("sensor_offset", {"offset_m": 0.056}, "sensor", marks=pytest.mark.slow),
         ("parameter_drift/damping", {}, "experiment"),
     ],
 )
@@ -659,18 +676,6 @@ def test_a_place_that_could_not_be_shaped_is_not_ruled_out() -> None:
     assert whereabouts([explains], [], fitted(10, 500.0)).likely == ("sensor",)
 
 
-def test_unexplained_says_where(tmp_path: Path) -> None:
-    """Without the candidate that it is, a flame delay ends as unexplained, on the flame's side."""
-    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
-    found = identify.diagnose(ready.campaign, catalogue=[by_key("channel_mismatch:gain")])
-    assert found.verdict == "unexplained"
-    assert found.whereabouts is not None
-    assert found.whereabouts.likely == ("flame",)
-    assert found.to_json()["whereabouts"]["likely"] == ["flame"]
-    assert "lies in the flame path" in found.explanation
-    assert "places" in [path.stem for path in save_figures(tmp_path / "figures", found)]
-
-
 def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     """A spread beside an effect is not claimed where a law explains the data with less."""
     ready = thesis_campaign(tmp_path, 8, {"flame_delay": {"delay_s": 3e-4}})
@@ -689,16 +694,18 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
 
 
 def test_a_gross_misfit_of_one_place_is_sought_nowhere_else(tmp_path: Path) -> None:
-    """A voice coil that no candidate names: the actuator's free shape explains it, and no other."""
+    """A voice coil that no candidate names: the actuator's free shape explains it, and no other.
+    It ends as unexplained, there, in words, numbers and a figure."""
     ready = thesis_campaign(tmp_path, 7, {"actuator_dynamics/voice_coil": {"pole_hz": 150.0}})
-    others = [
-        by_key(k) for k in ("channel_mismatch:gain", "sensor_dynamics:lowpass", "flame_delay")
-    ]
+    others = [by_key(k) for k in ("channel_mismatch:gain", "flame_delay")]
     found = identify.diagnose(ready.campaign, catalogue=others)
     assert found.verdict == "unexplained"
     assert found.whereabouts is not None
     assert found.whereabouts.likely == ("actuator",)
     assert {len(c.effects) for c in found.candidates} == {1}
+    assert found.to_json()["whereabouts"]["likely"] == ["actuator"]
+    assert "lies in the actuator" in found.explanation
+    assert "places" in [path.stem for path in save_figures(tmp_path / "figures", found)]
 
 
 def test_fitted_and_held_out_runs_speak_together(monkeypatch: pytest.MonkeyPatch) -> None:
