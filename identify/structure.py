@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from identify import dual
 from identify.dual import Dual
-from identify.parameters import Estimate, Parameter, ParameterSet
+from identify.parameters import Parameter, ParameterSet
 from identify.polynomial import Polynomial
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -213,11 +213,6 @@ class Effect:
                 return []
             row.append(known.pop(at)[1])
         return [tuple(row)]
-
-    def impossible(self, known: Mapping[str, Estimate]) -> bool:
-        """Whether the estimates say together what no such thing can be, each by itself in its
-        range, and by more than their uncertainty."""
-        return False
 
     def neutral(self) -> tuple[float, ...] | None:
         """Values at which the effect vanishes, where a score test can be taken; None: nowhere."""

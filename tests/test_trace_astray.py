@@ -13,8 +13,17 @@ from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.identification import prepare
+from identify.parameters import ParameterSet
 from identify.scatter import fit_scatter
-from identify.trace.contests import in_each_form, in_their_places, joins, matched, reformed
+from identify.structure import Mode
+from identify.trace.contests import (
+    in_each_form,
+    in_other_forms,
+    in_their_places,
+    joins,
+    matched,
+    reformed,
+)
 from identify.trace.tried import tried
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
@@ -248,3 +257,32 @@ def test_a_resonator_beside_the_singing_mode_at_its_own_frequency(tmp_path: Path
     giving = best.fit.theta.copy()
     giving[best.fit.structure.parameters.index["acoustic_mode.coupling"]] *= -1
     assert not replace(best, fit=replace(best.fit, theta=giving)).plausible
+
+
+def test_a_strong_resonator_with_its_mouth_near_a_node_of_the_singing_mode(tmp_path: Path) -> None:
+    """It feels mode 1 a sixtieth as much as mode 2, which it moves far."""
+    size = {"frequency_hz": 408.2528, "damping": 0.025258, "coupling": 0.0206826}
+    rig = random_rig(19021, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    branch = make_effect("side_resonator", size)
+    ready = record(tmp_path, 19021, rig, [branch], forced=10, validation=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    mode = only(ready, base, "acoustic_mode:mode")
+    assert mode.fit.chi2_per_dof > 100
+    (found,) = in_other_forms([mode], ready.data, [SideResonator(2)], InProcess())
+    assert found.explains
+    values = found.fit.values
+    assert abs(values["acoustic_mode.mouth2"]) > 30 * abs(values["acoustic_mode.mouth1"])
+    frequency = found.estimates["acoustic_mode.frequency_hz"]
+    assert abs(frequency.value - size["frequency_hz"]) < 4 * frequency.stderr
+
+
+def test_a_resonator_takes_energy_from_every_mode() -> None:
+    """A loss without a law among the candidates was claimed as one that gives, beside chance."""
+    branch = SideResonator(3)
+    rng = np.random.default_rng(1)
+    names = [q.name for q in branch.parameters]
+    modes = [Mode(170.0 * i, 0.01, 40.0, 30.0) for i in (1, 2, 3)]
+    for theta in rng.normal(size=(50, len(names))):
+        p = ParameterSet(branch.parameters).plain(theta)
+        load = branch.branch(p, modes, 2j * np.pi * 170.0)
+        assert all(f * r >= 0 for f, r in zip(load.felt, load.returned, strict=True))

@@ -154,7 +154,7 @@ class Tried:
         # without the flame's part in the mode that sings, nothing makes it sing
         located = ["mode1.flame_residue", *(n for e in self.effects for n in e.located)]
         seen = all(known[n].stderr <= abs(values[n]) for n in located)
-        if not (inside and seen) or any(e.impossible(known) for e in self.effects):
+        if not (inside and seen):
             return False
         modes = range(1, self.fit.structure.mode_count + 1)
         return all(values[f"mode{i}.damping"] < 0.7 for i in modes)
