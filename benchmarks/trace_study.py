@@ -65,7 +65,7 @@ COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, int], float]]] =
     ("acoustic_mode", "side_resonator", "side_resonator"): RESONANT,
     ("actuator_nonlinearity", "quadratic", "distortion"): {"a2": lambda t, n: t["quadratic_per_v"]},
     ("actuator_nonlinearity", "cubic", "compression"): {"a3": lambda t, n: -t["cubic_per_v2"]},
-    ("channel_mismatch", "skew", "skew"): {"skew_s": lambda t, n: -t["skew_s"]},
+    ("channel_mismatch", "skew", "skew"): {"skew_s": lambda t, n: t["skew_s"]},
     **{
         ("parameter_drift", what, what): {
             "relative_change": lambda t, n, what=what: t[f"{what}_change"] * (n - 1) / 10

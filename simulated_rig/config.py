@@ -57,7 +57,7 @@ class Interference:
 class Microphone:
     """One pressure channel: place, sensitivity, and its own faults.
 
-    `skew_s` > 0: sampled so much later than the first frame says. `lowpass_hz`: its own
+    `skew_s` > 0: it shows a signal common to all channels so much later. `lowpass_hz`: its own
     first-order bandwidth. `gain` multiplies the true pressure; what is recorded as the
     sensitivity stays `volts_per_pa`.
     """
@@ -74,8 +74,8 @@ class Microphone:
 
     @property
     def delay_s(self) -> float:
-        """How much the channel lags: skew samples later, hence leads."""
-        return self.phase_rad / (2 * 3.141592653589793 * self.phase_at_hz) - self.skew_s
+        """How much later the channel shows a signal common to all."""
+        return self.phase_rad / (2 * 3.141592653589793 * self.phase_at_hz) + self.skew_s
 
 
 @dataclass(frozen=True)

@@ -416,7 +416,7 @@ class GainMismatch(SecondMicrophone):
 
 @dataclass(frozen=True)
 class Skew(SecondMicrophone):
-    """It is sampled that much later (a multiplexed converter)."""
+    """It shows a signal common to both that much later (a multiplexed converter)."""
 
     variant = "skew"
     skew_s: float = parameter("s", 5e-7, 5e-5, signed=True)

@@ -123,8 +123,7 @@ def test_signed_starts_have_both_signs_in_each_other_mode(tmp_path: Path) -> Non
     ("form", "truth", "values"),
     [
         ("gain", {"gain": 0.02}, {"channel_mismatch.gain": 0.02}),
-        # what is sampled later is read as if it came earlier
-        ("skew", {"skew_s": 2e-5}, {"channel_mismatch.skew_s": -2e-5}),
+        ("skew", {"skew_s": -2e-5}, {"channel_mismatch.skew_s": -2e-5}),
     ],
 )
 def test_a_free_run_is_corrected_for_its_microphones(
@@ -239,7 +238,7 @@ def test_two_effects_of_one_place(tmp_path: Path) -> None:
 def test_a_late_channel_with_a_lag_of_its_own(tmp_path: Path) -> None:
     """Two of the same name: a form of both is tried where neither explains the data alone."""
     effects = {
-        "channel_mismatch/skew": {"skew_s": 2e-5},
+        "channel_mismatch/skew": {"skew_s": -2e-5},
         "channel_mismatch/lowpass": {"lowpass_hz": 4000.0},
     }
     ready = thesis_campaign(tmp_path, 4, effects, noise_db=60.0)

@@ -45,7 +45,8 @@ class ChannelMismatch(Effect):
     """The upper microphone reads g times the pressure: gain, sampling time, phase, low- or
     high-pass.
 
-    û_measured − û_true = −p̂₂ (1 − 1/g) / (ρ Δx s): common pressure leaks into the velocity.
+    û_measured − û_true = −p̂₂ (1 − 1/g) / (ρ Δx s): common pressure leaks into the velocity. A skew,
+    a phase and a low-pass time above zero are a lag of that microphone.
     """
 
     name, location = "channel_mismatch", "sensor"
