@@ -103,7 +103,7 @@ figure svg{{width:100%;height:auto;display:block}}
 figure svg text{{fill:var(--ink)}}
 figcaption{{color:var(--muted);font-size:.85rem;margin-top:.25rem;max-width:50rem}}
 math{{font-size:1.08rem}}
-math[display=block]{{margin:.6rem 0;text-align:left;overflow-x:auto}}
+math[display=block]{{margin:.3rem 0;padding:.3rem 0;text-align:left;overflow:auto hidden}}
 pre{{background:var(--tint);padding:.6rem .8rem;overflow-x:auto;font-size:.82rem}}
 @page{{size:A4;margin:14mm}}
 @media print{{html{{font-size:9.5pt}}body{{font-size:1rem}}main{{max-width:none;padding:0}}
