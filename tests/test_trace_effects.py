@@ -472,6 +472,28 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     assert again.fit.chi2 == pytest.approx(found.fit.chi2, rel=1e-2)
 
 
+def test_two_modes_in_one_place_are_one_too_many(tmp_path: Path) -> None:
+    """Of two that stand at one frequency against each other, neither is dropped as it is: what is
+    left would be the difference's one large part."""
+    ready = thesis_campaign(tmp_path, 5, {"flame_delay": {"delay_s": 3e-4}})
+    delay, mode = by_key("flame_delay"), by_key("acoustic_mode:mode")
+    base = start.fit_from_data(ready.structure, ready.data)
+    p = only(ready, base, delay.key).fit.values
+    split = {"flame_residue": -1300.0, "speaker_residue": 5e4}
+    for kind in ("frequency_hz", "damping"):
+        p[f"acoustic_mode.{kind}"] = p[f"mode2.{kind}"]
+    for kind, size in split.items():
+        p[f"acoustic_mode.{kind}"], p[f"mode2.{kind}"] = -size, p[f"mode2.{kind}"] + size
+    larger = ready.structure.with_effects(delay, mode)
+    theta = larger.parameters.to_internal([p[n] for n in larger.parameters.names])
+    same = fit_orbits(larger, ready.data, theta, continuation=(0.0,), iterations=0)
+    both = tried(larger.effects, same, ready.data)
+    assert both.adequate
+    kept = eliminate(both, ready.data)
+    assert kept.names == ("flame_delay",)
+    assert kept.fit.chi2 == pytest.approx(both.fit.chi2, rel=1e-2)
+
+
 def test_held_out_runs_have_a_say_in_what_is_needed(tmp_path: Path) -> None:
     """A speaker that drifts by 5e-4: what was fitted hardly shows it, the held-out runs do."""
     drifts = {"parameter_drift/speaker_gain": {"speaker_gain_change": 0.0005}}

@@ -87,6 +87,7 @@ def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     for e in t.effects:
         if e not in effects:
             known += _named_otherwise(e, t)
+            known += [p for p in (_merged(e, t, q) for q in known) if p is not None]
     thetas = np.stack([smaller.parameters.to_internal([p[n] for n in names]) for p in known])
     return fit_orbits(smaller, data, thetas, continuation=(0.003, 0.0))
 
@@ -111,6 +112,23 @@ def _named_otherwise(effect: Effect, t: Tried) -> list[dict[str, float]]:
             moved[q.name] = full[f"mode{added}.{kind}"]
         out.append({**values, **moved})
     return out
+
+
+def _merged(effect: Effect, t: Tried, p: Mapping[str, float]) -> dict[str, float] | None:
+    """Values `p` where the mode that `effect` adds lies within the width of a declared one: that
+    one does for both, with their residues together. None where it does not."""
+    plain = replace(t.fit.structure, effects=())
+    richer, count = effect.restated(plain), plain.mode_count
+    if richer is None or richer.mode_count != count + 1:
+        return None
+    f, zeta, *residues = (p[q.name] for q in effect.parameters)
+    near = min(range(1, count + 1), key=lambda i: abs(p[f"mode{i}.frequency_hz"] - f))
+    own = f"mode{near}"
+    wide = zeta * f + p[f"{own}.damping"] * p[f"{own}.frequency_hz"]
+    if abs(p[f"{own}.frequency_hz"] - f) > wide:
+        return None
+    both = zip(MODAL[2:], residues, strict=True)
+    return {**p, **{f"{own}.{kind}": p[f"{own}.{kind}"] + r for kind, r in both}}
 
 
 def eliminate(candidate: Tried, data: Dataset) -> Tried:
