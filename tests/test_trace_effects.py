@@ -492,6 +492,11 @@ def test_two_modes_in_one_place_are_one_too_many(tmp_path: Path) -> None:
     kept = eliminate(both, ready.data)
     assert kept.names == ("flame_delay",)
     assert kept.fit.chi2 == pytest.approx(both.fit.chi2, rel=1e-2)
+    # nor is it claimed where the delay had been declared
+    declared = ready.structure.with_effects(delay)
+    without = trace.without_effects(declared, ready.data, [both])
+    assert without is not None
+    assert without.chi2 == pytest.approx(both.fit.chi2, rel=1e-2)
 
 
 def test_held_out_runs_have_a_say_in_what_is_needed(tmp_path: Path) -> None:

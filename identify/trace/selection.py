@@ -622,9 +622,13 @@ def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried])
     if not best:
         return None
     good = [t for t in tries if t.explains]
-    best += [best_form(good)] if good else []
-    thetas = np.stack([t.fit.theta[:count] for t in best])
-    fit = fit_orbits(structure, data, thetas, continuation=(0.003, 0.0))
+    claimed = [best_form(good)] if good else []
+    thetas = np.stack([t.fit.theta[:count] for t in (*best, *claimed)])
+    fits = [fit_orbits(structure, data, thetas, continuation=(0.003, 0.0))]
+    # a mode may be one of the declared ones, of which one then stands for nothing
+    one_more = [t for t in claimed if any(e.restated(structure) for e in t.effects)]
+    fits += [with_fewer(t, structure.effects, data) for t in one_more]
+    fit = min(fits, key=lambda f: f.chi2)
     return fit if np.isfinite(fit.chi2) else None
 
 
