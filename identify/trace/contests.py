@@ -96,8 +96,8 @@ def _named_otherwise(effect: Effect, t: Tried) -> list[dict[str, float]]:
     """The values of `t` with another mode in the place of the one that `effect` adds, of which it
     has the name only: any of those that do not sing may be the one too many."""
     values, plain = t.fit.values, replace(t.fit.structure, effects=())
-    richer, count = effect.restated(plain), plain.mode_count
-    if richer is None or richer.mode_count != count + 1:
+    count = plain.mode_count
+    if not _adds_a_mode(effect, plain):
         return []
     full = {**values, **effect.to_restated(plain, values)}
     out = []
@@ -114,12 +114,17 @@ def _named_otherwise(effect: Effect, t: Tried) -> list[dict[str, float]]:
     return out
 
 
+def _adds_a_mode(effect: Effect, plain: Structure) -> bool:
+    richer = effect.restated(plain)
+    return richer is not None and richer.mode_count == plain.mode_count + 1
+
+
 def _merged(effect: Effect, t: Tried, p: Mapping[str, float]) -> dict[str, float] | None:
     """Values `p` where the mode that `effect` adds lies within the width of a declared one: that
     one does for both, with their residues together. None where it does not."""
     plain = replace(t.fit.structure, effects=())
-    richer, count = effect.restated(plain), plain.mode_count
-    if richer is None or richer.mode_count != count + 1:
+    count = plain.mode_count
+    if not _adds_a_mode(effect, plain):
         return None
     f, zeta, *residues = (p[q.name] for q in effect.parameters)
     near = min(range(1, count + 1), key=lambda i: abs(p[f"mode{i}.frequency_hz"] - f))
