@@ -13,6 +13,7 @@ from scipy import stats
 import identify
 from daq.importers import open_campaign
 from identify import dual, start, trace
+from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
@@ -20,7 +21,7 @@ from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.scatter import Spread, fit_scatter
-from identify.trace import stages
+from identify.trace import selection, stages
 from identify.trace.contests import at_the_same_place
 from identify.trace.stages import try_scatters
 from identify.trace.tried import BEATEN
@@ -300,6 +301,63 @@ def test_what_speaks_against_a_spread_may_be_luck(left: float, luck: float, clai
     assert (not one.objection) is claimed
     assert other.leaves_noise is (left > 300.0)
     assert same is law
+
+
+def beside(chance: trace.Tried, key: str, fit_p: float) -> trace.Tried:
+    return replace(chance, effects=(by_key(key), *chance.effects), fit_p=fit_p)
+
+
+def test_of_a_law_beside_chance_too_where_no_other_comes_near() -> None:
+    chance = spread_of(900.0, "")
+    law, shape = tried_as(fitted(1, 500.0), "flame_delay"), tried_as(fitted(2, 400.0))
+    hardly = beside(chance, "flame_delay", 0.05)
+    farther = beside(chance, "acoustic_mode:mode", 1e-4)
+    first, *_ = trace.unrivalled([hardly, farther, law], [shape])
+    assert not hardly.leaves_noise
+    assert first.leaves_noise
+    another = beside(chance, "acoustic_mode:mode", 0.02)
+    assert not any(t.leaves_noise for t in trace.unrivalled([hardly, another, law], [shape])[:2])
+
+
+def test_chance_does_for_a_law_of_the_same_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A random walk of the frequency looks like a curve and chance in the drive: one effect less,
+    where that explains the data; a walk that follows the time does not."""
+    monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: not t.objection))
+    drive = spread_of(170.0, "")
+    (random,) = [s for s in SCATTERS if s.name == "parameter_drift"]
+    walk = replace(spread_of(178.0, ""), effects=(random,))
+    curve = beside(drive, "parameter_drift:frequency_curve", 0.5)
+    alone = spread_of(400.0, "")
+    declared = trace.Tried((), fitted(0, 50.0), 1e-2, 0.0, 0.0)
+    assert not trace.accounts(curve, declared, [curve, alone, walk])
+    assert trace.rivals(walk, [walk, curve]) == []
+    assert walk.spread is not None
+    ordered = replace(walk, spread=replace(walk.spread, objection="frequency_rms follows the time"))
+    assert trace.accounts(curve, declared, [curve, alone, ordered])
+
+
+def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It always takes up nearly all: beside a wrong law it is no sign that the right one is near
+    (thesis's rig, compression beside a walk)."""
+    asked: list[str] = []
+    nothing = replace(fitted(0, 0.0), chi2=np.inf)
+    monkeypatch.setattr(selection, "fit_from_data", lambda structure, soft: nothing)
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    going = selection._Searching(
+        nothing.structure, Dataset((), (), 0.0), fitted(0, 900.0), InProcess(),
+        lambda share, text: asked.append(text), (), (), (),
+    )  # fmt: skip
+    near = beside(spread_of(900.0, ""), "flame_delay", 1e-9)
+    going.tried = [replace(near, fit=fitted(0, 6.0)), tried_as(fitted(1, 400.0), "flame_delay")]
+    going.tried[1] = replace(going.tried[1], fit_p=0.0)
+    going.with_chance([])
+    assert [t for t in asked if t.startswith("looking at the data to within")]
+    asked.clear()
+    going.tried.append(replace(going.tried[1], fit=fitted(1, 20.0)))
+    going.with_chance([])
+    assert not [t for t in asked if t.startswith("looking at the data to within")]
 
 
 @pytest.mark.parametrize("form", ["tanh_gain", "arctan_gain", "quadratic_odd"])

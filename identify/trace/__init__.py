@@ -18,8 +18,9 @@
    shaped piece that is far likelier; a spread, no spread at another place.
 5. Where nothing explains the data, freely shaped pieces and the single effects say where in the
    loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`). Where
-   none of all these but a spread comes near, that one is claimed though it looks a little less
-   random than most: with no law to hide, it is (`selection.unrivalled`).
+   none of all these but a spread, or one law beside one, comes near, that is claimed though it
+   looks a little less random, or leaves a little more, than most: with no law to hide, it is
+   (`selection.unrivalled`).
 """
 
 from identify.trace.places import deviating, remembering, shaped, whereabouts

@@ -186,6 +186,10 @@ class _Searching:
         return any(t.explains for t in self.spreads_alone)
 
     @property
+    def laws(self) -> list[Tried]:
+        return [t for t in self.tried if t.spread is None]
+
+    @property
     def spreads_alone(self) -> list[Tried]:
         return [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
 
@@ -308,7 +312,7 @@ class _Searching:
             (LAW_SOFTENED, self._law_from_softened),
         ):
             for share in shares:
-                if not self.explained and _least(self.tried) > MUCH:
+                if not self.explained and _least(self.laws) > MUCH:  # a spread always comes near
                     self.report(0.6, f"looking at the data to within {share:.1%}")
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
@@ -374,10 +378,9 @@ class _Searching:
         """What might do as well as the best is tried before it is claimed, and, where nothing can
         be, the foremost of what does not explain the data in other forms."""
         if not self.explained:
-            certain = [t for t in self.tried if t.spread is None]
-            self.tried += reformed(certain, self.data, self.forms, self.run, self.done)
+            self.tried += reformed(self.laws, self.data, self.forms, self.run, self.done)
         self._contest()
-        first = foremost([t for t in self.tried if t.spread is None and t.plausible])
+        first = foremost([t for t in self.laws if t.plausible])
         if self.explained and not self.accounted and first is not None and not first.explains:
             self.report(0.95, "trying other forms of the foremost")
             others = reformed([first], self.data, self.forms, self.run, self.done)
@@ -388,7 +391,7 @@ class _Searching:
     def _contest(self) -> None:
         data, run = self.data, self.run
         self.tried += runners_up(self.tried, data, self.forms, run, self.done)
-        several = [t for t in self.tried if len(t.effects) > 1 and t.spread is None]
+        several = [t for t in self.laws if len(t.effects) > 1]
         if any(t.explains for t in several):
             self.tried += in_other_forms(several, data, self.forms, run)
         near = at_the_same_place(several, data, self.available, run)
@@ -435,8 +438,9 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
 
 
 def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
-    """Spreads alone are marked where no law comes near the data: none of `tries`, and none of the
-    freely shaped `pieces`, which may follow the runs' conditions however they like.
+    """Spreads are marked where no law comes near the data: none of `tries`, and none of the
+    freely shaped `pieces`, which may follow the runs' conditions however they like. Beside a law,
+    only that of which no other does as well as to be adequate.
 
     There is then no law that a spread could hide, and what speaks against it by a small chance
     alone (`tried.LUCK`) is what so many questions bring about now and then.
@@ -444,9 +448,10 @@ def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
     laws = [t.fit.chi2_per_dof for t in (*tries, *pieces) if t.spread is None]
     if min(laws, default=0.0) <= NO_CHANCE:
         return list(tries)
+    beside = {t.key for t in tries if t.spread is not None and len(t.effects) > 1 and t.adequate}
     return [
         replace(t, spread=replace(t.spread, unrivalled=True))
-        if t.spread is not None and len(t.effects) == 1
+        if t.spread is not None and (len(t.effects) == 1 or beside == {t.key})
         else t
         for t in tries
     ]

@@ -68,6 +68,12 @@ class Tried:
         again = {f"{name}, once more" for name in laws if laws.count(name) > 1}
         return frozenset({*laws, *again, *(e.key for e in self.effects if isinstance(e, Scatter))})
 
+    def within(self, t: "Tried") -> bool:
+        """Whether `t` has all of this and more; where this explains the data, by name too: chance
+        then does for the law that goes by the same."""
+        named = Counter(self.names) < Counter(t.names)
+        return self.parts < t.parts or (named and self.explains)
+
     @property
     def words(self) -> str:
         """The effects' names; their forms too where two go by the same."""
@@ -264,11 +270,11 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         if t.key != best.key
         and (t.explains or _chance_rivals(t, best) or _stands_for_another(t, best))
         and min(t.evidence - best.evidence, t.evidence_of_all - best.evidence_of_all) < EVIDENCE
-        and not best.parts < t.parts
+        and not best.within(t)
         and not _extends(t, best)
     ]
     found = best_by_name(every)
-    return [t for t in found if not any(o.parts < t.parts for o in found)]
+    return [t for t in found if not any(o.within(t) for o in found)]
 
 
 def _stands_for_another(t: Tried, best: Tried) -> bool:
@@ -327,7 +333,7 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
     mostly = t.excess < without.excess / 3
     if t.spread is not None:
-        alone = [o for o in tries if o.spread and o.parts < t.parts]
+        alone = [o for o in tries if o.spread and o.within(t)]
         found = all(gain_p(o.deviance - t.deviance, t, o.fit) < ALPHA for o in alone)
         least = min([without.evidence, *(o.evidence for o in alone)])
         hidden = t.validation_error > ASTRAY * declared.validation_error
