@@ -6,6 +6,7 @@ from itertools import combinations, product
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from identify.parameters import Parameter
 from identify.polynomial import Polynomial
@@ -22,6 +23,8 @@ from identify.structure import (
     declared_modes,
     resonance,
 )
+
+FloatArray = npt.NDArray[np.float64]
 
 
 class AcousticMode(Effect):
@@ -107,65 +110,32 @@ def _mode_parameters(which: str) -> tuple[Parameter, ...]:
     )
 
 
-class SideResonator(Effect):
-    """A resonator beside the tube, a Helmholtz resonator or a plenum, coupled to `modes` modes.
+class _Resonator(Effect):
+    """A resonator beside the tube, coupled to the first `count` modes.
 
     y'' + 2ζω y' + ω² y = ω² Σ h_i η_i, with the displacements η_i at its mouth, and it pushes back
-    on mode i by −g_i h_i y'', g_1 = 1. So g_i h_i ω² s/(s² + 2ζωs + ω²) loads the velocity there.
-    Of a mode that has a node at the mouth it feels nothing and gives nothing back, h_i = 0; and it
-    takes energy from every mode, never gives, g_i > 0.
-    Other than one more mode, it moves the poles of the others, and its residues have phases.
-    Beside the singing mode the load on that one alone, κ = h_1², is most of it:
-    ``side_resonator_mode``.
+    on mode i by −g_i h_i y''. So g_i h_i ω² s/(s² + 2ζωs + ω²) loads the velocity there.
     """
 
     name, location = "acoustic_mode", "forward"
+    own = (
+        Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
+        Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
+    )
+    count: int
 
-    def __init__(self, modes: int | None = None) -> None:
-        self.form = "side_resonator_mode" if modes is None else "side_resonator"
-        self.mode_count, self.count = modes, modes or 1
-        self.refines = modes is not None
-        each = range(1, self.count + 1)
-        own = (
-            Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
-            Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
-        )
-        self.parameters = (
-            (*own, Parameter("acoustic_mode.coupling", "1", 0.0, 1.0, scale=1e-3))
-            if modes is None
-            else (
-                *own,
-                *(Parameter(f"acoustic_mode.mouth{i}", "1", -3.0, 3.0, scale=0.03) for i in each),
-                *(
-                    Parameter(f"acoustic_mode.return_ratio{i}", "1", 1e-4, 1e4, "positive")
-                    for i in each[1:]
-                ),
-            )
-        )
+    def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
+        """What of each mode it feels, and what it gives back."""
+        raise NotImplementedError
 
-    def starts(self, known: Known) -> list[tuple[float, ...]]:
-        if self.refines:
-            felt = (0.055,) * self.count
-            ones = (1.0,) * (self.count - 1)
-            return [(q * known.free_hz, 0.04, *felt, *ones) for q in (0.8, 1.3, 1.9)]
-        return [(q * known.free_hz, 0.04, 1e-3) for q in (0.8, 0.9, 1.05, 1.15, 1.4)]
-
-    def shapes(self, known: Known) -> list[tuple[float, ...]]:
-        if self.refines:
-            return []
-        frequencies = known.free_hz * np.geomspace(0.6, 1.7, 27)
-        return [(float(f), zeta, 0.0) for f in frequencies for zeta in (0.02, 0.05)]
-
-    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+    def of_a_mode(
+        self, other: Effect, values: Mapping[str, float]
+    ) -> tuple[float, float, tuple[float, float], FloatArray] | None:
         """From one more mode: at its frequency the load takes the place of its residues, so that
         r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise, with κ_i = κ_1 q_i taken for the
-        g_i h_i. From mode 1 alone to all."""
-        if isinstance(other, SideResonator) and self.refines:
-            f, zeta, coupling = (values[q.name] for q in other.parameters)
-            none, ones = (0.0,) * (self.count - 1), (1.0,) * (self.count - 1)
-            return [(f, zeta, np.sqrt(max(coupling, 0.0)), *none, *ones)]
+        g_i h_i. Frequency, damping, κ_1 to start from and q (count,); None from another effect."""
         if not isinstance(other, AcousticMode) or other.more > 1:
-            return []
+            return None
         f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
         s = 2j * np.pi * f
         modes = declared_modes(values, self.count)
@@ -177,29 +147,89 @@ class SideResonator(Effect):
         if self.count > 1 and np.all(part[1:] != 0):
             q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
         size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
-        rows = []
+        if not np.isfinite([f, zeta, size.real, *q]).all():
+            return None
         # a strong one has moved the modes: from a tenth of the load they are brought there
-        for load in (size.real, 0.1 * size.real):
-            if self.refines:
-                rows.append((f, zeta, *(np.sqrt(abs(load)) * q), *(1.0,) * (self.count - 1)))
-            else:
-                rows.append((f, zeta, load))
-        return rows if np.isfinite(rows).all() else []
+        return f, zeta, (size.real, 0.1 * size.real), q
 
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
         f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]
         w = 2 * np.pi * f
-        own = [p[q.name] for q in self.parameters[2:]]
-        felt, ratios = own[: self.count], own[self.count :]
-        returned = [felt[0], *(g * h for g, h in zip(ratios, felt[1:], strict=True))]
-        if not self.refines:
-            felt = [1.0]  # κ whole in what comes back
+        felt, returned = self.coupled(p)
         none = [0.0] * (len(modes) - self.count)  # modes of another effect
         return Branch(
             impedance=resonance(Mode(f, zeta, 0.0, 0.0), s) * (w * w),
             felt=[*felt, *none],
             returned=[*returned, *none],
         )
+
+
+class SideResonatorOfMode(_Resonator):
+    """A resonator beside the tube of which the singing mode's load κ = h_1² is all that matters."""
+
+    form, count = "side_resonator_mode", 1
+    parameters = (*_Resonator.own, Parameter("acoustic_mode.coupling", "1", 0.0, 1.0, scale=1e-3))
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(q * known.free_hz, 0.04, 1e-3) for q in (0.8, 0.9, 1.05, 1.15, 1.4)]
+
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        frequencies = known.free_hz * np.geomspace(0.6, 1.7, 27)
+        return [(float(f), zeta, 0.0) for f in frequencies for zeta in (0.02, 0.05)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        found = self.of_a_mode(other, values)
+        if found is None:
+            return []
+        f, zeta, loads, _ = found
+        return [(f, zeta, load) for load in loads]
+
+    def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
+        return [1.0], [p["acoustic_mode.coupling"]]
+
+
+class SideResonator(_Resonator):
+    """A Helmholtz resonator or a plenum beside the tube, coupled to `modes` modes, g_1 = 1.
+
+    Of a mode that has a node at the mouth it feels nothing and gives nothing back, h_i = 0; and it
+    takes energy from every mode, never gives, g_i > 0. Other than one more mode, it moves the
+    poles of the others, and its residues have phases.
+    """
+
+    form, refines = "side_resonator", True
+
+    def __init__(self, modes: int) -> None:
+        self.mode_count = self.count = modes
+        each = range(1, modes + 1)
+        self.felt = tuple(
+            Parameter(f"acoustic_mode.mouth{i}", "1", -3.0, 3.0, scale=0.03) for i in each
+        )
+        self.ratios = tuple(
+            Parameter(f"acoustic_mode.return_ratio{i}", "1", 1e-4, 1e4, "positive")
+            for i in each[1:]
+        )
+        self.parameters = (*self.own, *self.felt, *self.ratios)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        felt, ones = (0.055,) * self.count, (1.0,) * len(self.ratios)
+        return [(q * known.free_hz, 0.04, *felt, *ones) for q in (0.8, 1.3, 1.9)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From one more mode, or from what loads mode 1 alone."""
+        ones = (1.0,) * len(self.ratios)
+        if isinstance(other, SideResonatorOfMode):
+            f, zeta, coupling = (values[q.name] for q in other.parameters)
+            return [(f, zeta, np.sqrt(max(coupling, 0.0)), *(0.0,) * len(ones), *ones)]
+        found = self.of_a_mode(other, values)
+        if found is None:
+            return []
+        f, zeta, loads, q = found
+        return [(f, zeta, *(np.sqrt(abs(load)) * q), *ones) for load in loads]
+
+    def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
+        felt = [p[q.name] for q in self.felt]
+        ratios = [p[q.name] for q in self.ratios]
+        return felt, [felt[0], *(g * h for g, h in zip(ratios, felt[1:], strict=True))]
 
 
 LOSSES = {"quadratic": (2, "1/m"), "cubic": (3, "s/m²")}  # power of the velocity, unit
@@ -277,7 +307,7 @@ MODE_COUNTS = (2, 3, 4)  # of models for which there are forms with a share of e
 EFFECTS: tuple[Effect, ...] = (
     AcousticMode(),
     AcousticMode("two_modes", 2),
-    SideResonator(),
+    SideResonatorOfMode(),
     *(SideResonator(n) for n in MODE_COUNTS),
     NonlinearDamping("quadratic"),
     NonlinearDamping("quadratic_mode"),
