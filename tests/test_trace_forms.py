@@ -360,6 +360,32 @@ def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     assert not [t for t in asked if t.startswith("looking at the data to within")]
 
 
+def test_beside_chance_a_law_s_forms_start_from_where_it_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Coarse noise had led a resonator's load on one mode astray, not the further mode that it
+    looks like (a side resonator beside a walk, 30304)."""
+    mode = tried_as(fitted(14, 0.9), "acoustic_mode:mode")
+    astray = tried_as(fitted(13, 1.4), "acoustic_mode:side_resonator_mode")
+    loaded = tried_as(fitted(13, 0.88), "acoustic_mode:side_resonator_mode")
+    asked: list[trace.Tried] = []
+
+    def scattered(going: Any, structure: Any, fit: Any) -> list[trace.Tried]:
+        asked.extend(t for t in (mode, astray, loaded) if t.fit is fit)
+        return []
+
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    monkeypatch.setattr(selection, "try_effects", lambda *a, **k: [mode, astray])
+    monkeypatch.setattr(selection, "in_each_form", lambda t, *a, **k: [loaded])
+    monkeypatch.setattr(selection._Searching, "_scattered", scattered)
+    data, base = Dataset((), (), 0.0), replace(fitted(0, 2.0), theta=np.zeros(11))
+    going = selection._Searching(
+        base.structure, data, base, InProcess(), lambda share, text: None, (), (), ()
+    )
+    going._law_from_softened(data, base)
+    assert [t.fit for t in asked] == [loaded.fit, mode.fit]
+
+
 @pytest.mark.parametrize("form", ["tanh_gain", "arctan_gain", "quadratic_odd"])
 def test_characteristics_and_their_derivatives(form: str) -> None:
     effect = by_key(f"nonlinearity_shape:{form}")

@@ -339,11 +339,13 @@ class _Searching:
             far=astray(base), progress=lambda done, text: None,
         )  # fmt: skip
         found = []
-        forms = best_of_each_form(laws)
         for best in best_by_name(laws)[:FOREMOST]:
+            alike = [t for t in laws if t.key == best.key]
+            alike += in_each_form(best, soft, self.apart, self.run)
+            forms = best_of_each_form(alike)
             # what coarse noise does not tell apart, the noise itself may
-            most = ALIKE * misfit(best)
-            for t in [t for t in forms if t.key == best.key and misfit(t) < most][:FORMS]:
+            most = ALIKE * misfit(forms[0])
+            for t in [t for t in forms if misfit(t) < most][:FORMS]:
                 found += self._scattered(t.fit.structure, t.fit)
         found += _simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
