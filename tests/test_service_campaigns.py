@@ -165,7 +165,9 @@ def test_a_skipped_condition_is_left_out(server: Running, client: httpx.Client) 
     result = client.get(f"/jobs/{number}/result").json()
     assert [o["status"] for o in result["outcomes"]].count("skipped") == 2
     runs = client.get(f"/campaigns/{campaign}").json()["runs"]
-    assert [r["kind"] for r in runs] == ["free"]
+    # a run that lost frames on a busy machine is kept beside the one that was recorded anew
+    assert [r["kind"] for r in runs if r["exit_status"] == "success"] == ["free"]
+    assert {r["kind"] for r in runs} == {"free"}
 
 
 def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> None:
