@@ -17,6 +17,7 @@ from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
+from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
@@ -336,6 +337,12 @@ def test_chance_does_for_a_law_of_the_same_name(monkeypatch: pytest.MonkeyPatch)
     assert trace.accounts(curve, declared, [curve, alone, ordered])
 
 
+def searching(base: Fit, report: Callable[[float, str], None]) -> selection._Searching:
+    """A search under way from there, on data of which nothing is looked at."""
+    none = Dataset((), (), 0.0)
+    return selection._Searching(base.structure, none, base, InProcess(), report, (), (), ())
+
+
 def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -345,17 +352,14 @@ def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     nothing = replace(fitted(0, 0.0), chi2=np.inf)
     monkeypatch.setattr(selection, "fit_from_data", lambda structure, soft: nothing)
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    going = selection._Searching(
-        nothing.structure, Dataset((), (), 0.0), fitted(0, 900.0), InProcess(),
-        lambda share, text: asked.append(text), (), (), (),
-    )  # fmt: skip
-    near = beside(spread_of(900.0, ""), "flame_delay", 1e-9)
-    going.tried = [replace(near, fit=fitted(0, 6.0)), tried_as(fitted(1, 400.0), "flame_delay")]
-    going.tried[1] = replace(going.tried[1], fit_p=0.0)
+    going = searching(fitted(0, 900.0), lambda share, text: asked.append(text))
+    near = replace(beside(spread_of(900.0, ""), "flame_delay", 1e-9), fit=fitted(0, 6.0))
+    law = replace(tried_as(fitted(1, 400.0), "flame_delay"), fit_p=0.0)
+    going.tried = [near, law]
     going.with_chance([])
     assert [t for t in asked if t.startswith("looking at the data to within")]
     asked.clear()
-    going.tried.append(replace(going.tried[1], fit=fitted(1, 20.0)))
+    going.tried.append(replace(law, fit=fitted(1, 20.0)))
     going.with_chance([])
     assert not [t for t in asked if t.startswith("looking at the data to within")]
 
@@ -378,11 +382,9 @@ def test_beside_chance_a_law_s_forms_start_from_where_it_ended(
     monkeypatch.setattr(selection, "try_effects", lambda *a, **k: [mode, astray])
     monkeypatch.setattr(selection, "in_each_form", lambda t, *a, **k: [loaded])
     monkeypatch.setattr(selection._Searching, "_scattered", scattered)
-    data, base = Dataset((), (), 0.0), replace(fitted(0, 2.0), theta=np.zeros(11))
-    going = selection._Searching(
-        base.structure, data, base, InProcess(), lambda share, text: None, (), (), ()
-    )
-    going._law_from_softened(data, base)
+    base = replace(fitted(0, 2.0), theta=np.zeros(11))
+    going = searching(base, lambda share, text: None)
+    going._law_from_softened(going.data, base)
     assert [t.fit for t in asked] == [loaded.fit, mode.fit]
 
 

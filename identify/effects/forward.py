@@ -118,10 +118,7 @@ class _Resonator(Effect):
     """
 
     name, location = "acoustic_mode", "forward"
-    own = (
-        Parameter("acoustic_mode.frequency_hz", "Hz", 5.0, 5e3, "positive"),
-        Parameter("acoustic_mode.damping", "1", 5e-4, 0.5, "positive"),
-    )
+    own = _mode_parameters("")[:2]  # frequency and damping, as of any mode
     count: int
 
     def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
@@ -130,12 +127,12 @@ class _Resonator(Effect):
 
     def of_a_mode(
         self, other: Effect, values: Mapping[str, float]
-    ) -> tuple[float, float, tuple[float, float], FloatArray] | None:
+    ) -> list[tuple[float, float, float, FloatArray]]:
         """From one more mode: at its frequency the load takes the place of its residues, so that
         r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise, with κ_i = κ_1 q_i taken for the
-        g_i h_i. Frequency, damping, κ_1 to start from and q (count,); None from another effect."""
+        g_i h_i. Frequency, damping, κ_1 and q (count,); none from another effect."""
         if not isinstance(other, AcousticMode) or other.more > 1:
-            return None
+            return []
         f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
         s = 2j * np.pi * f
         modes = declared_modes(values, self.count)
@@ -148,9 +145,9 @@ class _Resonator(Effect):
             q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
         size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
         if not np.isfinite([f, zeta, size.real, *q]).all():
-            return None
+            return []
         # a strong one has moved the modes: from a tenth of the load they are brought there
-        return f, zeta, (size.real, 0.1 * size.real), q
+        return [(f, zeta, load, q) for load in (size.real, 0.1 * size.real)]
 
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
         f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]
@@ -178,11 +175,7 @@ class SideResonatorOfMode(_Resonator):
         return [(float(f), zeta, 0.0) for f in frequencies for zeta in (0.02, 0.05)]
 
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
-        found = self.of_a_mode(other, values)
-        if found is None:
-            return []
-        f, zeta, loads, _ = found
-        return [(f, zeta, load) for load in loads]
+        return [(f, zeta, load) for f, zeta, load, _ in self.of_a_mode(other, values)]
 
     def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
         return [1.0], [p["acoustic_mode.coupling"]]
@@ -221,10 +214,7 @@ class SideResonator(_Resonator):
             f, zeta, coupling = (values[q.name] for q in other.parameters)
             return [(f, zeta, np.sqrt(max(coupling, 0.0)), *(0.0,) * len(ones), *ones)]
         found = self.of_a_mode(other, values)
-        if found is None:
-            return []
-        f, zeta, loads, q = found
-        return [(f, zeta, *(np.sqrt(abs(load)) * q), *ones) for load in loads]
+        return [(f, zeta, *(np.sqrt(abs(load)) * q), *ones) for f, zeta, load, q in found]
 
     def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
         felt = [p[q.name] for q in self.felt]
