@@ -106,6 +106,11 @@ class Orbits:
     d_omega: FloatArray | None = None
     d_inputs: ComplexArray | None = None
 
+    @property
+    def seen(self) -> "Orbits":
+        """The same without the inputs, of which no measurement tells."""
+        return replace(self, inputs=self.inputs[:0], d_inputs=None)
+
     def take(self, part: npt.NDArray[np.int64]) -> "Orbits":
         """Some of the rows."""
         return Orbits(
@@ -147,16 +152,16 @@ def solve(
     limit = np.where(rows.free, 2, 1) * MAX_ITERATIONS
     if iterations is not None:
         limit = np.full(rows.runs, iterations)
-    values = structure.parameters.plain(vectors, at.runs)
-    begin = rows if start_omega is None else replace(rows, omega=start_omega)
-    first = _inputs_from_velocity(structure, values, rows) if start is None else start
-    orbits = _newton(structure, values, begin, first, limit)
+    columns = structure.parameters.columns(vectors, at.runs)
+    begin = rows.omega if start_omega is None else start_omega
+    first = _inputs_from_velocity(structure, columns, rows) if start is None else start
+    orbits = _newton(structure, columns, rows, begin, first, limit)
     if start is not None and not orbits.converged.all():
         again = np.flatnonzero(~orbits.converged)
-        some = {n: v[again] for n, v in values.items()}
-        fewer = rows.take(again)
+        some, fewer = columns[again], rows.take(again)
         measured = _inputs_from_velocity(structure, some, fewer)
-        orbits = _merge(orbits, _newton(structure, some, fewer, measured, limit[again]), again)
+        found = _newton(structure, some, fewer, fewer.omega, measured, limit[again])
+        orbits = _merge(orbits, found, again)
     return differentiate(structure, vectors, at, orbits) if derivatives else orbits
 
 
@@ -169,8 +174,11 @@ def differentiate(
     return _differentiate(structure, vectors, values, rows, at.runs, orbits)
 
 
-def _inputs_from_velocity(structure: Structure, values: Values, at: Conditions) -> ComplexArray:
+def _inputs_from_velocity(
+    structure: Structure, columns: FloatArray, at: Conditions
+) -> ComplexArray:
     """Nonlinearity inputs implied by the measured velocity: the start on the measured branch."""
+    values = structure.parameters.by_name(columns)
     s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
     with np.errstate(all="ignore"):
         y = at_the_flame(structure.effects, values, at, s)
@@ -180,25 +188,31 @@ def _inputs_from_velocity(structure: Structure, values: Values, at: Conditions) 
 
 
 def _newton(
-    structure: Structure, p: Values, at: Conditions, start: ComplexArray, limit: IntArray
+    structure: Structure,
+    columns: FloatArray,
+    at: Conditions,
+    omega: FloatArray,
+    start: ComplexArray,
+    limit: IntArray,
 ) -> Orbits:
-    K, free = at.harmonics, at.free
-    v, omega = start.copy(), at.omega.copy()
-    if free.any():
+    """Orbits of all rows, from `start` and `omega`; `columns` (rows, p) are physical values."""
+    K, free = at.harmonics, at.free_rows
+    v, omega = start.copy(), omega.copy()
+    if free.size:
         v[:, free] *= np.exp(-1j * np.angle(v[0, free, :1]) * np.arange(1, K + 1))
     error, predicted = np.full(at.runs, np.inf), np.empty((at.runs, K), dtype=complex)
     rows, left = np.arange(at.runs), limit
     with np.errstate(all="ignore"):
         while rows.size:
-            near = _assembled(structure, p, at, omega[rows], len(v))
+            near = _assembled(structure, columns, at, omega[rows], len(v))
             found = _solved(near, v[:, rows], omega[rows], at.free, left)
             away = found[1] - omega[rows]
             v[:, rows], omega[rows], error[rows], taken, forces = found
             predicted[rows] = near.velocity(forces, away)
             # the others were solved where the terms were assembled, or near enough
             again = np.flatnonzero(at.free & (taken > 0) & ~(np.abs(away) < NEAR * omega[rows]))
-            rows, left, at = rows[again], (left - taken)[again], at.take(again)
-            p = {n: x[again] for n, x in p.items()}
+            rows, left, columns = rows[again], (left - taken)[again], columns[again]
+            at = at.of_free if np.array_equal(again, at.free_rows) else at.take(again)
     converged = (error < 1e-8) & np.isfinite(predicted).all(axis=1)
     return Orbits(v, predicted, omega, converged)
 
@@ -230,14 +244,14 @@ class _Assembled:
 
 
 def _assembled(
-    structure: Structure, p: Values, at: Conditions, omega: FloatArray, loops: int
+    structure: Structure, columns: FloatArray, at: Conditions, omega: FloatArray, loops: int
 ) -> _Assembled:
-    K, rows, free = at.harmonics, at.runs, np.flatnonzero(at.free)
-    apart, N = APART * omega[free], structure.characteristics(p, at)
+    K, rows, free = at.harmonics, at.runs, at.free_rows
+    apart, p = APART * omega[free], structure.parameters.by_name(columns)
+    N = structure.characteristics(p, at)
     if free.size:
-        both = np.concatenate([np.arange(rows), free])
-        p, at = {n: x[both] for n, x in p.items()}, at.take(both)
-        omega = np.concatenate([omega, omega[free] + apart])
+        p = structure.parameters.by_name(np.concatenate([columns, columns[free]]))
+        omega, at = np.concatenate([omega, omega[free] + apart]), at.with_free_again
     loop = structure.assemble(p, at, 1j * omega[:, None] * np.arange(1, K + 1))
     P = np.empty((loops, loops, at.runs, K), dtype=complex)
     Q = np.empty((loops, at.runs, K), dtype=complex)

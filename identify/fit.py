@@ -180,8 +180,9 @@ class OrbitResidual:
         rows, jacobians = [], []
         with np.errstate(all="ignore"):
             orbits = self._orbits(thetas, which, jacobian)
+            seen = orbits.seen
             for batch, own in self._parts(vectors):
-                rho, J = compare(batch, orbits.take(own))
+                rho, J = compare(batch, seen.take(own))
                 rows.append(rho.reshape(vectors, -1))
                 if J is not None:
                     jacobians.append(J.reshape(vectors, -1, J.shape[-1]))

@@ -120,19 +120,26 @@ class ParameterSet:
         of these parameters alone, a seed each in their order.
         """
         chosen = np.arange(len(self)) if only is None else only
-        unit = np.eye(chosen.size, chosen.size + extra)[:, None, None, :]
-        columns = np.repeat(self.to_physical(internal), rows, axis=0)
-        slopes = np.repeat(self.slopes(internal), rows, axis=0)
+        columns = self.columns(internal, rows)
+        slopes = np.repeat(self.slopes(internal)[:, chosen], rows, axis=0)
+        d = slopes[:, :, None] * np.eye(chosen.size, chosen.size + extra)
         return {
-            self.names[j]: dual.Dual(columns[:, j : j + 1], unit[i] * slopes[:, j, None, None])
-            for i, j in enumerate(chosen)
+            self.names[j]: dual.Dual(columns[:, j : j + 1], d[:, i : i + 1])
+            for i, j in enumerate(chosen.tolist())
         }
 
     def plain(self, internal: FloatArray, rows: int = 0) -> dict[str, Any]:
         """Physical values by name: floats of one vector (p,), or (vectors·rows, 1) of several."""
         if internal.ndim == 1:
             return dict(zip(self.names, self.to_physical(internal).tolist(), strict=True))
-        columns = np.repeat(self.to_physical(internal), rows, axis=0)
+        return self.by_name(self.columns(internal, rows))
+
+    def columns(self, internal: FloatArray, rows: int) -> FloatArray:
+        """Physical values of several vectors, each for so many rows: (vectors·rows, p)."""
+        return np.repeat(self.to_physical(internal), rows, axis=0)
+
+    def by_name(self, columns: FloatArray) -> dict[str, Any]:
+        """The columns (rows, 1) of physical values (rows, p), by name."""
         return {name: columns[:, j : j + 1] for j, name in enumerate(self.names)}
 
     def bounds(self) -> tuple[FloatArray, FloatArray]:

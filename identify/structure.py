@@ -92,6 +92,20 @@ class Conditions:
     def _tiled(self) -> dict[int, "Conditions"]:
         return {}
 
+    @cached_property
+    def free_rows(self) -> IntArray:
+        return np.flatnonzero(self.free)
+
+    @cached_property
+    def of_free(self) -> "Conditions":
+        """The same for the free runs alone."""
+        return self.take(self.free_rows)
+
+    @cached_property
+    def with_free_again(self) -> "Conditions":
+        """All runs, and behind them the free ones once more."""
+        return self.take(np.concatenate([np.arange(self.runs), self.free_rows]))
+
     def padded(self, harmonics: int) -> "Conditions":
         """The same with columns of zeros up to so many harmonics, where there are fewer."""
         missing = ((0, 0), (0, max(harmonics - self.harmonics, 0)))
@@ -561,12 +575,9 @@ def resonance(mode: Mode, s: Any) -> Any:
     if not (isinstance(s, Dual) or isinstance(w, Dual)):
         return b
     q = b * b / sv  # −∂b/∂(denominator)
-    return dual.chain(
-        b,
-        (b / sv - q * (2.0 * sv + 2.0 * zv * wv), s),
-        (-q * (2.0 * zv * sv + 2.0 * wv), w),
-        (-q * (2.0 * wv * sv), z),
-    )
+    terms = [(b / sv - q * (2.0 * sv + 2.0 * zv * wv), s)] if isinstance(s, Dual) else []
+    terms += [(-q * (2.0 * zv * sv + 2.0 * wv), w), (-q * (2.0 * wv * sv), z)]
+    return dual.chain(b, *terms)
 
 
 def _low_pass(top: Any, pole: Any, s: Any) -> Any:

@@ -199,6 +199,7 @@ def test_other_forms_of_what_leaves_a_gross_misfit(tmp_path: Path) -> None:
     assert right.estimates["actuator_nonlinearity.order"].value == pytest.approx(8.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_two_time_scales_of_the_flame_behind_a_lag(tmp_path: Path) -> None:
     """Neither a lag nor a second time scale explains both; from where another form has come, whose
     response is matched first, the two poles and the zero are found."""

@@ -163,7 +163,12 @@ def test_many_tests_count_as_many_as_they_are() -> None:
 @pytest.mark.parametrize(
     ("form", "key", "truth"),
     [
-        ("hysteresis", "nonlinearity_shape", {"hysteresis_width": 0.01}),
+        pytest.param(
+            "hysteresis",
+            "nonlinearity_shape",
+            {"hysteresis_width": 0.01},
+            marks=pytest.mark.slow,
+        ),
         ("dead_zone", "nonlinearity_shape", {"dead_zone_width": 0.01}),
         ("quadratic_end", "nonlinear_damping", {"quadratic_per_m": 5.0}),
     ],
@@ -337,6 +342,7 @@ def test_a_resonance_far_above_is_found_from_the_lag_that_it_makes() -> None:
     assert resonance.starts_from(delay, {"actuator_dynamics.delay_s": -1e-6}) == []
 
 
+@pytest.mark.slow
 def test_a_rival_is_not_ruled_out_for_want_of_iterations(tmp_path: Path) -> None:
     """A second time scale of the flame beside a drift, both small: what it leaves falls slowly."""
     effects = {
@@ -392,6 +398,7 @@ def test_which_mode_is_the_further_one_is_named_by_rule_beside_another_effect(
     assert best.fit.values["acoustic_mode.frequency_hz"] == pytest.approx(345.0, abs=1.0)
 
 
+@pytest.mark.slow
 def test_a_small_effect_is_found_beside_a_gross_one(tmp_path: Path) -> None:
     """A compressing speaker beside a microphone that lags 18 µs: coarse noise, at which effects are
     tried first, loses what the fit with the lag knows; the tangent promises nearly all the rest."""
@@ -547,11 +554,11 @@ def test_a_claim_takes_most_of_the_misfit_away(
 @pytest.mark.parametrize(
     ("key", "parameters", "place"),
     [
-        ("nonlinear_damping/cubic", {}, "forward"),
+        pytest.param("nonlinear_damping/cubic", {}, "forward", marks=pytest.mark.slow),
         ("flame_delay", {"delay_s": 3e-4}, "flame"),
         ("nonlinearity_shape/quartic", {}, "nonlinearity"),
         ("nonlinear_damping/quadratic", {"quadratic_per_m": 20.0}, "forward"),
-        ("actuator_dynamics/voice_coil", {}, "actuator"),
+        pytest.param("actuator_dynamics/voice_coil", {}, "actuator", marks=pytest.mark.slow),
         ("actuator_dynamics/voice_coil", {"pole_hz": 150.0}, "actuator"),
         ("actuator_nonlinearity/clipping", {}, "actuator"),
         ("channel_mismatch/gain", {}, "sensor"),
@@ -600,6 +607,7 @@ def test_a_free_shape_restated_says_the_same(tmp_path: Path, piece: type[Shaped]
     assert start.coarse(larger, data, [same], 0.01)[0].cost == pytest.approx(one, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
     tmp_path: Path,
 ) -> None:
@@ -719,6 +727,7 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
     assert trace.rivals(other, [replace(beside, validation_p=1e-17)]) == []
 
 
+@pytest.mark.slow
 def test_a_gross_misfit_of_one_place_is_sought_nowhere_else(tmp_path: Path) -> None:
     """A voice coil that no candidate names: the actuator's free shape explains it, and no other."""
     ready = thesis_campaign(tmp_path, 7, {"actuator_dynamics/voice_coil": {"pole_hz": 150.0}})
@@ -759,6 +768,7 @@ def test_a_form_that_extends_the_best_hides_no_rival(monkeypatch: pytest.MonkeyP
     assert trace.rivals(delay, [delay, distributed, resonance]) == [resonance]
 
 
+@pytest.mark.slow
 def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -793,6 +803,7 @@ def test_two_drifts_at_once_are_one_effect_with_two_changes(tmp_path: Path) -> N
         assert abs(found.value - truth * over) < 4 * found.stderr
 
 
+@pytest.mark.slow
 def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> None:
     """The drift of the speaker's gain is not the best of the effects alone, nor the modulation
     enough: it stands out where the modulation has been accounted for."""

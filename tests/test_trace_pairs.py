@@ -27,6 +27,7 @@ THIRD_MODE = {
 DELAY_S = 8e-4
 
 
+@pytest.mark.slow
 def test_a_further_mode_beside_another_gross_effect(tmp_path: Path) -> None:
     effects = {"acoustic_mode": THIRD_MODE, "flame_delay": {"delay_s": DELAY_S}}
     ready = thesis_campaign(tmp_path, 4, effects)
