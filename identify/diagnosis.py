@@ -32,7 +32,7 @@ from identify.results import (
     Verdict,
 )
 from identify.structure import Effect, Structure
-from identify.trace import ALPHA, Cancelled, Tried
+from identify.trace import ALPHA, EVIDENCE, Cancelled, Tried
 from identify.trace.tried import best_by_name
 from identify.trace.tried import tried as as_tried
 
@@ -314,7 +314,7 @@ def _judge(
     ranked = sorted(
         (t for t in tried if t.plausible and t.fit.chi2 < least), key=lambda t: t.fit.chi2
     )
-    near = _nearly(ranked, least, data)
+    near = _nearly(ranked, least, data.noise_floor(data.validation), pieces)
     if near is not None:
         words = near.words
         return "traced", near, (
@@ -336,28 +336,32 @@ def _judge(
     return "unexplained", chosen, said + left
 
 
-def _nearly(ranked: Sequence[Tried], base_chi2: float, data: Dataset) -> Tried | None:
-    """A candidate that leaves a statistically visible but practically empty residual.
+def _nearly(
+    ranked: Sequence[Tried], base_chi2: float, floor: float, pieces: Sequence[Tried]
+) -> Tried | None:
+    """A law alone that leaves a statistically visible but practically empty residual.
 
-    It must take away 99.8 % of the excess misfit, predict held-out runs within 1.5 times the
-    noise, and stand ten times better than any other effect: an idealisation (a slightly other
-    law of the same effect) may then remain, another cause hardly.
+    It must take away 99.8 % of the excess misfit, predict held-out runs within 1.5 times the noise
+    (`floor`; none without such runs), and stand ten times better than any law or laws without it
+    and far likelier than a spread; nor may a free shape be far likelier. An idealisation (a
+    slightly other law of the same effect) may then remain, or bad luck; another cause hardly.
     """
-    if not ranked or not data.validation:
+    best = next((t for t in ranked if len(t.effects) == 1 and t.spread is None), None)
+    if best is None or not best.fit.converged or best.fit.chi2_per_dof > 3.0:
         return None
-    best, floor = ranked[0], data.noise_floor(data.validation)
-    others = [t.fit.chi2 for t in ranked if t.key != best.key and len(t.key) <= len(best.key)]
     excess = max(best.fit.chi2 - best.fit.dof, 0.0)
-    if (
-        len(best.effects) == 1
-        and best.fit.converged
-        and best.fit.chi2_per_dof < 3.0
-        and excess < 0.002 * (base_chi2 - best.fit.dof)
-        and best.validation_error < 1.5 * floor
-        and (not others or min(others) > 10 * best.fit.chi2)
-    ):
-        return best
-    return None
+    empty = excess < 0.002 * (base_chi2 - best.fit.dof)
+    if not (empty and best.validation_error < 1.5 * floor):
+        return None
+    others = [t for t in ranked if best.names[0] not in t.names]
+    rivalled = any(
+        t.fit.chi2 < 10 * best.fit.chi2
+        if t.spread is None
+        else t.evidence < best.evidence + EVIDENCE
+        for t in others
+    )
+    outdone = any(t.evidence < best.evidence - EVIDENCE for t in pieces if t.spread is None)
+    return None if rivalled or outdone else best
 
 
 def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:

@@ -1,8 +1,9 @@
 """Named parameters: physical values outside, well-scaled unknowns inside.
 
 A positive quantity (a frequency, a damping, a time) is fitted by its logarithm, so that no step
-of the optimiser can make it negative; a signed one (a residue, a coefficient) as it is. Standard
-errors are carried through by the derivative of that map.
+of the optimiser can make it negative; a signed one (a residue, a coefficient) as it is; an even
+one (an inverse level, zero where nothing saturates) too, but the equations are even in it, and its
+value is its size. Standard errors are carried through by the derivative of that map.
 """
 
 from collections.abc import Sequence
@@ -33,7 +34,7 @@ class Parameter:
     unit: str
     lower: float = -np.inf
     upper: float = np.inf
-    kind: Literal["positive", "signed"] = "signed"
+    kind: Literal["positive", "signed", "even"] = "signed"
     scale: float = 1.0
 
     def to_internal(self, value: float) -> float:
@@ -41,7 +42,9 @@ class Parameter:
 
     def to_physical(self, internal: float) -> float:
         """Physical value of an unknown."""
-        return float(np.exp(internal)) if self.kind == "positive" else internal * self.scale
+        if self.kind == "positive":
+            return float(np.exp(internal))
+        return (abs(internal) if self.kind == "even" else internal) * self.scale
 
     def plausible(self, value: float) -> bool:
         """Whether it lies in the range; a positive one, kept there by the fit, not at its edge."""
@@ -96,11 +99,12 @@ class ParameterSet:
 
     def to_physical(self, internal: FloatArray) -> FloatArray:
         """Physical values of a vector of unknowns, or of several, (…, p)."""
-        return np.where(self._positive, np.exp(internal * self._positive), internal * self._scales)
+        signed = internal * self._mirrored(internal)
+        return np.where(self._positive, np.exp(internal * self._positive), signed)
 
     def slopes(self, internal: FloatArray) -> FloatArray:
         """d(physical)/d(internal), (…, p)."""
-        return np.where(self._positive, self.to_physical(internal), self._scales)
+        return np.where(self._positive, self.to_physical(internal), self._mirrored(internal))
 
     @cached_property
     def _positive(self) -> npt.NDArray[np.bool_]:
@@ -109,6 +113,14 @@ class ParameterSet:
     @cached_property
     def _scales(self) -> FloatArray:
         return np.array([p.scale for p in self.parameters])
+
+    @cached_property
+    def _even(self) -> npt.NDArray[np.bool_]:
+        return np.array([p.kind == "even" for p in self.parameters], dtype=bool)
+
+    def _mirrored(self, internal: FloatArray) -> FloatArray:
+        """The scales, negative where an even unknown is."""
+        return np.where(self._even & (internal < 0), -self._scales, self._scales)
 
     def seeded(
         self, internal: FloatArray, rows: int, extra: int = 0, only: IntArray | None = None

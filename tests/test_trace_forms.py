@@ -12,12 +12,12 @@ from scipy import stats
 
 import identify
 from daq.importers import open_campaign
-from identify import dual, start, trace
+from identify import diagnosis, dual, start, trace
 from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import Fit
+from identify.fit import Fit, OrbitResidual
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
@@ -454,3 +454,55 @@ def test_of_forms_as_likely_the_usual_one_is_named(chi2_of_lowpass: float, form:
     skew = tried_as(fitted(0, 1.0), "channel_mismatch:skew")
     lowpass = tried_as(fitted(0, chi2_of_lowpass / 119), "channel_mismatch:lowpass")
     assert trace.best_form([lowpass, skew]).effects[0].form == form
+
+
+@pytest.mark.parametrize("key", ["nonlinearity_shape:tanh", "actuator_nonlinearity:saturation"])
+def test_a_level_below_zero_is_the_same_level(tmp_path: Path, key: str) -> None:
+    """The laws are even in it: a fit that has passed zero has found what it looked for."""
+    ready = thesis_campaign(tmp_path, 5, {"flame_delay": {"delay_s": 3e-5}})
+    structure = ready.structure.with_effects(by_key(key))
+    name = by_key(key).parameters[0].name
+    base = start.fit_from_data(ready.structure, ready.data).theta
+    level = 0.3 if name.startswith("actuator") else 100.0
+    above, below = np.r_[base, level], np.r_[base, -level]
+    assert structure.parameters.plain(below)[name] == level
+    assert structure.parameters.plain(np.stack([above, below]), 1)[name].tolist() == [[level]] * 2
+    residual = OrbitResidual(structure, ready.data.fit)
+    found = residual(np.stack([above, below]), np.arange(2), True)
+    assert found.exists.all()
+    assert found.residual[0] == pytest.approx(found.residual[1], rel=1e-9, abs=1e-9)
+    assert found.jacobian is not None
+    assert found.jacobian[0, :, -1] == pytest.approx(-found.jacobian[1, :, -1], rel=1e-6)
+    by_value = structure.parameters.slopes(below)[-1]
+    assert by_value == -structure.parameters.slopes(above)[-1] == -1.0
+    (q,) = by_key(key).parameters
+    assert q.plausible(q.to_physical(-level))
+
+
+def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_near() -> None:
+    """A drift of which χ²/dof 1.8 is left of 27 000, by bad luck: what adds to it leaves less, and
+    is no rival of it; what stands in its place is, and so is a free shape that does far better."""
+
+    def left(chi2: float, *keys: str) -> trace.Tried:
+        effects = tried_as(fitted(10 + len(keys), chi2), *keys)
+        return replace(effects, fit_p=0.0)
+
+    drift = left(1.8, "parameter_drift:frequency")
+    more = left(1.6, "parameter_drift:frequency", "acoustic_mode:mode")
+    afar, near = left(900.0, "flame_delay"), left(10.0, "flame_delay")
+    pair = left(2.5, "flame_delay", "acoustic_mode:mode")
+    same, better = left(1.8, "parameter_drift:several"), left(1.0, "parameter_drift:several")
+
+    def claimed(*tries: trace.Tried, floor: float = 1e-3, shape: trace.Tried = same) -> bool:
+        ranked = sorted(tries, key=lambda t: t.fit.chi2)
+        return diagnosis._nearly(ranked, 27000.0 * 109, floor, [shape]) is drift
+
+    assert claimed(drift, more, afar)
+    assert not claimed(drift, more, near)
+    assert not claimed(drift, more, afar, pair)
+    assert not claimed(drift, more, afar, shape=better)
+    assert not claimed(drift, more, afar, floor=5e-4)
+    assert not claimed(left(1.8, "parameter_drift:frequency"), more, floor=float("nan"))
+    spread = Spread(drift.fit, None, {}, 0.0, "")  # type: ignore[arg-type]
+    walk = replace(drift, spread=spread)
+    assert diagnosis._nearly([walk, afar], 27000.0 * 109, 1e-3, []) is None

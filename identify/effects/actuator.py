@@ -171,7 +171,7 @@ class Clipping(Effect):
     """The amplifier saturates: L tanh(u/L)."""
 
     name, location, form = "actuator_nonlinearity", "actuator", "saturation"
-    parameters = (Parameter("actuator_nonlinearity.inverse_level", "1/V", 0.0),)
+    parameters = (Parameter("actuator_nonlinearity.inverse_level", "1/V", 0.0, np.inf, "even"),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.3 / known.drive_amplitude,), (1.0 / known.drive_amplitude,)]

@@ -64,7 +64,7 @@ class Saturation(Effect):
     """
 
     name, location = "nonlinearity_shape", "nonlinearity"
-    parameters = (Parameter("nonlinearity_shape.inverse_level", "1/m", 0.0),)
+    parameters = (Parameter("nonlinearity_shape.inverse_level", "1/m", 0.0, np.inf, "even"),)
 
     def __init__(self, form: str) -> None:
         self.form = form
@@ -86,7 +86,7 @@ class SaturatingGain(Effect):
     """
 
     name, location = "nonlinearity_shape", "nonlinearity"
-    parameters = (Parameter("nonlinearity_shape.inverse_level", "1/m", 0.0),)
+    parameters = (Parameter("nonlinearity_shape.inverse_level", "1/m", 0.0, np.inf, "even"),)
 
     def __init__(self, form: str) -> None:
         self.form = form
