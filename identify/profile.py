@@ -151,6 +151,10 @@ def _profiled(
     parameters = fit.structure.parameters.parameters
     for i, (j, side) in enumerate(sides):
         if np.isfinite(found[i]):
-            value = float(parameters[j].to_physical(float(fit.theta[j] + found[i] * sigma[j])))
-            ends[j][1 if side == 0 else 0] = value
+            q, here = parameters[j], float(fit.theta[j])
+            there = here + float(found[i] * sigma[j])
+            even = q.kind == "even"
+            # of an even unknown only the size counts, which is least at zero
+            value = 0.0 if even and here * there < 0 else q.to_physical(there)
+            ends[j][1 if (side == 0) != (even and here < 0) else 0] = value
     return {j: (a, b) for j, (a, b) in ends.items()}

@@ -12,7 +12,7 @@ from scipy import stats
 
 import identify
 from daq.importers import open_campaign
-from identify import diagnosis, dual, start, trace
+from identify import diagnosis, dual, profile, start, trace
 from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
@@ -35,6 +35,7 @@ from simulated_rig.campaigns import (
     write_campaign,
 )
 from simulated_rig.config import RigConfig
+from simulated_rig.effects import EFFECTS
 from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.test_identify_balance import forced_conditions
@@ -506,3 +507,29 @@ def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_nea
     spread = Spread(drift.fit, None, {}, 0.0, "")  # type: ignore[arg-type]
     walk = replace(drift, spread=spread)
     assert diagnosis._nearly([walk, afar], 27000.0 * 109, 1e-3, []) is None
+
+
+def test_a_mirrored_fit_has_the_same_interval(tmp_path: Path) -> None:
+    """Its ends stand the right way round, and none is below zero."""
+    drawn = EFFECTS["nonlinearity_shape/saturation"].draw(np.random.default_rng(5), 0.5)
+    truth = {n: float(v["value"]) for n, v in drawn.parameters().items()}
+    ready = thesis_campaign(tmp_path, 7, {"nonlinearity_shape/saturation": truth})
+    base = start.fit_from_data(ready.structure, ready.data)
+    fit = only(ready, base, "nonlinearity_shape:tanh").fit
+    assert fit.converged
+    last = fit.theta.size - 1
+    turn = np.where(np.arange(fit.theta.size) == last, -1.0, 1.0)
+    mirrored = replace(
+        fit,
+        theta=fit.theta * turn,
+        covariance=fit.covariance * np.outer(turn, turn),
+        jacobian=fit.jacobian * turn,
+    )
+    (low, high), (low_too, high_too) = (
+        profile._profiled(f, ready.data, [last])[last] for f in (fit, mirrored)
+    )
+    assert low is not None
+    assert high is not None
+    value = fit.values["nonlinearity_shape.inverse_level"]
+    assert low < value < high
+    assert (low_too, high_too) == (pytest.approx(low, rel=1e-3), pytest.approx(high, rel=1e-3))
