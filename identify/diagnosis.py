@@ -360,8 +360,9 @@ def _nearly(
         else t.evidence < best.evidence + EVIDENCE
         for t in others
     )
-    outdone = any(t.evidence < best.evidence - EVIDENCE for t in pieces if t.spread is None)
-    return None if rivalled or outdone else best
+    # unlike for `trace.outdone`, it need not be adequate: the law is not either
+    bettered = any(t.evidence < best.evidence - EVIDENCE for t in pieces if t.spread is None)
+    return None if rivalled or bettered else best
 
 
 def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:

@@ -40,12 +40,6 @@ class Parameter:
     def to_internal(self, value: float) -> float:
         return float(np.log(max(value, 1e-300))) if self.kind == "positive" else value / self.scale
 
-    def to_physical(self, internal: float) -> float:
-        """Physical value of an unknown."""
-        if self.kind == "positive":
-            return float(np.exp(internal))
-        return (abs(internal) if self.kind == "even" else internal) * self.scale
-
     def plausible(self, value: float) -> bool:
         """Whether it lies in the range; a positive one, kept there by the fit, not at its edge."""
         edge = EDGE if self.kind == "positive" else 0.0
@@ -120,6 +114,8 @@ class ParameterSet:
 
     def _mirrored(self, internal: FloatArray) -> FloatArray:
         """The scales, negative where an even unknown is."""
+        if not self._even.any():
+            return self._scales
         return np.where(self._even & (internal < 0), -self._scales, self._scales)
 
     def seeded(

@@ -148,13 +148,14 @@ def _profiled(
         if done.all():
             break
     ends: dict[int, list[float | None]] = {j: [None, None] for j in which}
-    parameters = fit.structure.parameters.parameters
-    for i, (j, side) in enumerate(sides):
+    parameters = fit.structure.parameters
+    centre = parameters.to_physical(fit.theta)
+    for i, (j, _) in enumerate(sides):
         if np.isfinite(found[i]):
-            q, here = parameters[j], float(fit.theta[j])
-            there = here + float(found[i] * sigma[j])
-            even = q.kind == "even"
-            # of an even unknown only the size counts, which is least at zero
-            value = 0.0 if even and here * there < 0 else q.to_physical(there)
-            ends[j][1 if (side == 0) != (even and here < 0) else 0] = value
+            there = fit.theta.copy()
+            there[j] += found[i] * sigma[j]
+            even = parameters.parameters[j].kind == "even"
+            passed = even and fit.theta[j] * there[j] < 0  # its size is least at zero
+            value = 0.0 if passed else float(parameters.to_physical(there)[j])
+            ends[j][int(value > centre[j])] = value
     return {j: (a, b) for j, (a, b) in ends.items()}

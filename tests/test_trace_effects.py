@@ -41,10 +41,11 @@ from identify.trace.selection import (
 from identify.trace.stages import by_name, known_sizes, try_scatters
 from identify.trace.tried import tried
 from simulated_rig import build_config
-from simulated_rig.effects import EFFECTS, make_effect
+from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
 from tests.trace_material import (
     campaign,
+    drawn_values,
     fitted,
     only,
     record,
@@ -570,9 +571,7 @@ def test_what_no_candidate_explains_is_placed(
     tmp_path: Path, key: str, parameters: dict[str, float], place: str
 ) -> None:
     """A freely shaped piece takes the misfit up where it lies, and nowhere else."""
-    drawn = EFFECTS[key].draw(np.random.default_rng(5), 0.5)
-    values = parameters or {n: float(v["value"]) for n, v in drawn.parameters().items()}
-    ready = thesis_campaign(tmp_path, 7, {key: values})
+    ready = thesis_campaign(tmp_path, 7, {key: parameters or drawn_values(key)})
     base = start.fit_from_data(ready.structure, ready.data)
     pieces = shaped(ready.structure, ready.data, base, [], InProcess(), lambda share, text: None)
     found = whereabouts(pieces, [], base)

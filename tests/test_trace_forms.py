@@ -35,12 +35,12 @@ from simulated_rig.campaigns import (
     write_campaign,
 )
 from simulated_rig.config import RigConfig
-from simulated_rig.effects import EFFECTS
 from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.test_identify_balance import forced_conditions
 from tests.trace_material import (
     altered_campaign,
+    drawn_values,
     fitted,
     only,
     record,
@@ -477,7 +477,7 @@ def test_a_level_below_zero_is_the_same_level(tmp_path: Path, key: str) -> None:
     by_value = structure.parameters.slopes(below)[-1]
     assert by_value == -structure.parameters.slopes(above)[-1] == -1.0
     (q,) = by_key(key).parameters
-    assert q.plausible(q.to_physical(-level))
+    assert q.plausible(structure.parameters.plain(below)[name])
 
 
 def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_near() -> None:
@@ -511,9 +511,8 @@ def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_nea
 
 def test_a_mirrored_fit_has_the_same_interval(tmp_path: Path) -> None:
     """Its ends stand the right way round, and none is below zero."""
-    drawn = EFFECTS["nonlinearity_shape/saturation"].draw(np.random.default_rng(5), 0.5)
-    truth = {n: float(v["value"]) for n, v in drawn.parameters().items()}
-    ready = thesis_campaign(tmp_path, 7, {"nonlinearity_shape/saturation": truth})
+    key = "nonlinearity_shape/saturation"
+    ready = thesis_campaign(tmp_path, 7, {key: drawn_values(key)})
     base = start.fit_from_data(ready.structure, ready.data)
     fit = only(ready, base, "nonlinearity_shape:tanh").fit
     assert fit.converged

@@ -18,7 +18,7 @@ from identify.structure import Structure
 from simulated_rig import build_config
 from simulated_rig.campaigns import RecordedRun, simulate_campaign, write_campaign
 from simulated_rig.config import RigConfig
-from simulated_rig.effects import make_effect
+from simulated_rig.effects import EFFECTS, make_effect
 from simulated_rig.random_rigs import random_campaign, random_rig
 from simulated_rig.seal import SealedEffect
 
@@ -105,6 +105,12 @@ def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tri
     found = trace.search(ready.structure, ready.data, base, catalogue=[by_key(k) for k in keys])
     best = trace.best_form([t for t in found.tried if t.explains])
     return best, trace.rivals(best, found.tried)
+
+
+def drawn_values(key: str) -> dict[str, float]:
+    """The parameters of an effect of the rig, of a middling size."""
+    drawn = EFFECTS[key].draw(np.random.default_rng(5), 0.5)
+    return {name: float(p["value"]) for name, p in drawn.parameters().items()}
 
 
 def fitted(parameters: int, chi2_per_dof: float) -> Fit:
