@@ -76,9 +76,14 @@ def table(result: BroadbandDiagnosis) -> str:
         f" left {rest.chi2_per_dof:.2f} times the noise power, most in {rest.worst_band_hz} Hz;"
         f" {result.seconds:.1f} s"
     )
+    for w in result.weighed:
+        answer = "claimed" if w in result.claims else "not claimed"
+        rows.append(
+            f"  without {w.score.candidate.kind}: {w.without:.3g} times the excess: {answer}"
+        )
     rows += [
         f"  {name:<40}{p['value']:>14.6g} ± {p['stderr']:<9.2g}{p['unit']}"
-        for name, p in result.stages[-1].parameters.items()
+        for name, p in result.final.parameters.items()
     ]
     return "\n".join(rows)
 

@@ -99,7 +99,8 @@ def score_test(record: Excitation, fitted: Fit, whiten: Whitener) -> list[Score]
     _, jacobian = record.predict(probed, theta)
     column = {name: jacobian[:, i] for i, name in enumerate(probed.names)}
     own = whiten(np.column_stack([column[name] for name in fitted.structure.names]))
-    basis, _ = np.linalg.qr(own / np.linalg.norm(own, axis=0))
+    size = np.linalg.norm(own, axis=0)
+    basis, _ = np.linalg.qr(own / np.where(size > 0, size, 1.0))
     residual = whiten(fitted.residual)
     residual = residual - basis @ (basis.T @ residual)
     total = float(residual @ residual)

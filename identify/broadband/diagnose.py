@@ -2,10 +2,10 @@
 
 Stage by stage: fit by simulation error, score-test the candidates on the whitened residual, refit
 with the strongest, keep it if the plain simulation error of the estimation samples falls by more
-than `MATERIAL`, else try the next; stop when none does. The test samples are only ever predicted.
-Fits minimise the plain mean square, before and after alike; their standard errors are the
-sandwich that a coloured residual demands. What is left is compared, band by band, with the noise
-that a weakly excited stretch of the same record shows, if one is named.
+than `MATERIAL`, else try the next; stop when none does. Then each is left out again, and only what
+accounts for its part is claimed (`claims`). The test samples are only ever predicted. Fits minimise
+the plain mean square, before and after alike; their standard errors are the sandwich that a
+coloured residual demands. What is left is judged against the noise (`rest`).
 """
 
 import time
@@ -15,20 +15,19 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import welch
 
 from identify.broadband.candidates import Score, score_test
+from identify.broadband.claims import Outcome, Step, Weighed, weigh
 from identify.broadband.fit import Fit, Whitener, fit
 from identify.broadband.lines import Lines
 from identify.broadband.model import LINEAR, Excitation, Structure
-from identify.chances import f_tail
+from identify.broadband.rest import SIGNIFICANT, Remainder, noise_of, remainder
 
 FloatArray = npt.NDArray[np.float64]
 Declared = Literal["linear", "cubic", "cubic_quadratic"]
 Verdict = Literal["no_discrepancy", "traced", "ambiguous", "unexplained"]
 
 MATERIAL = 0.005  # least relative fall of the estimation RMS that counts as an effect
-SIGNIFICANT = 1e-3
 _INTEGRATION = 0.05  # integration error over residual, RMS: half of MATERIAL as a share
 _DECLARED: dict[str, tuple[str, ...]] = {
     "linear": LINEAR,
@@ -54,26 +53,17 @@ class Stage:
 
 
 @dataclass(frozen=True)
-class Remainder:
-    """A residual against noise: RMS of both, worst band, and the corrected p of that band."""
-
-    rms: float
-    noise_rms: float | None
-    chi2_per_dof: float | None
-    p_value: float | None
-    worst_band_hz: tuple[float, float] | None
-
-    @property
-    def significant(self) -> bool | None:
-        return None if self.p_value is None else self.p_value < SIGNIFICANT
-
-
-@dataclass(frozen=True)
 class BroadbandDiagnosis:
-    """All stages, the verdict, and what is left."""
+    """All stages, the final model with what is claimed, the verdict, and what is left.
+
+    `remainders` are those of the stages, `remainder` that of the `final` model.
+    """
 
     declared: str
     stages: tuple[Stage, ...]
+    final: Stage
+    weighed: tuple[Weighed, ...]
+    claims: tuple[Weighed, ...]
     verdict: Verdict
     remainder: Remainder
     remainders: tuple[Remainder, ...]
@@ -85,7 +75,7 @@ class BroadbandDiagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """The `diagnosis/1` object; `stages` and `remainder` go beyond the contract."""
-        first, last = self.stages[0], self.stages[-1]
+        first = self.stages[0]
         noise = self.remainder.noise_rms
         return {
             "format": "diagnosis/1",
@@ -96,7 +86,7 @@ class BroadbandDiagnosis:
             "noise_floor": None if noise is None else noise / self.test_scale,
             "before": _summary(first, self.remainders[0]),
             "residual": {
-                "significant": len(self.stages) > 1 or bool(self.remainders[0].significant),
+                "significant": len(self.stages) > 1 or self.remainders[0].significant,
                 "p_value": min(
                     [s.p_value for s in first.scores]
                     + [p for p in (self.remainders[0].p_value,) if p is not None]
@@ -109,34 +99,40 @@ class BroadbandDiagnosis:
             "verdict": self.verdict,
             "effects": [
                 {
-                    "effect": s.added.candidate.effect,
-                    "location": s.added.candidate.location,
-                    "kind": s.added.candidate.kind,
-                    "equivalent_to": list(s.added.candidate.equivalent_to),
-                    "parameters": {
-                        k: v for k, v in last.parameters.items() if k in _new(self.stages, i)
-                    },
+                    "effect": w.score.candidate.effect,
+                    "location": w.score.candidate.location,
+                    "kind": w.score.candidate.kind,
+                    "equivalent_to": [*w.score.candidate.equivalent_to, *w.rivals],
+                    "parameters": self._own(w.score),
                 }
-                for i, s in enumerate(self.stages)
-                if s.added is not None
+                for w in self.claims
             ],
-            "after": _summary(last, self.remainder),
+            "after": _summary(self.final, self.remainder),
             "next_experiment": self._next(),
             "stages": [
                 _summary(s, r)
                 | {"added": None if s.added is None else s.added.candidate.effect}
                 | {"kind": None if s.added is None else s.added.candidate.kind}
+                | {"claimed": s.added in [w.score for w in self.claims]}
                 for s, r in zip(self.stages, self.remainders, strict=True)
             ],
             "remainder": {
                 "rms": self.remainder.rms,
                 "noise_rms": noise,
+                "noise_source": self.remainder.noise_source,
+                "follows_motion": self.remainder.follows,
                 "unit": self.unit,
                 "significant": self.remainder.significant,
                 "worst_band_hz": self.remainder.worst_band_hz,
             },
             "notes": list(self.notes),
         }
+
+    def _own(self, score: Score) -> dict[str, dict[str, float | str]]:
+        """The final values of the parameters that came with this term."""
+        at = [s.added for s in self.stages].index(score)
+        new = set(self.stages[at].parameters) - set(self.stages[at - 1].parameters)
+        return {k: v for k, v in self.final.parameters.items() if k in new}
 
     def _next(self) -> dict[str, Any] | None:
         if self.verdict not in {"ambiguous", "unexplained"}:
@@ -204,14 +200,26 @@ def diagnose_broadband(
         score, found = following
         record, found = _resolved(record, found, plain)
         stages.append(_stage(record, found, score, estimation, test, lines, warm_up))
-    remainders = tuple(_remainder(record, s.fit, stages[-1].fit, estimation, noise) for s in stages)
+    known = noise_of(stages[-1].fit, record.u, lines, noise)
+    steps = [
+        Step(after.added, before.fit, after.fit, before.scores)
+        for before, after in pairwise(stages)
+        if after.added is not None
+    ]
+    outcome = weigh(record, steps, stages[0].fit, estimation, known)
+    final = stages[-1]
+    if outcome.fit.structure != final.fit.structure:
+        final = _stage(record, outcome.fit, None, estimation, test, lines, warm_up)
     test_y = record.y[test.start + warm_up : test.stop]
     return BroadbandDiagnosis(
         declared=declared,
         stages=tuple(stages),
-        verdict=_verdict(stages, remainders),
-        remainder=remainders[-1],
-        remainders=remainders,
+        final=final,
+        weighed=outcome.weighed,
+        claims=outcome.claims,
+        verdict=_verdict(outcome),
+        remainder=outcome.remainder,
+        remainders=tuple(remainder(record, s.fit, estimation, outcome.noise) for s in stages),
         seconds=time.perf_counter() - began,
         title=title,
         test_scale=float(np.sqrt(np.mean(test_y**2))),
@@ -309,64 +317,22 @@ def _with_scores(stage: Stage, scores: tuple[Score, ...]) -> Stage:
     return Stage(**{**stage.__dict__, "scores": scores})
 
 
-def _remainder(
-    record: Excitation, fitted: Fit, last: Fit, estimation: slice, noise: slice | None
-) -> Remainder:
-    """Residual power over noise power in bands: F statistics, the worst Bonferroni-corrected.
-
-    A band of Welch's spectrum with B bins from M half-overlapping Hann segments has about
-    2·B·M·0.65/1.5 degrees of freedom (neighbouring bins of a Hann window share half their power).
-    """
-    residual = fitted.residual[estimation]
-    rms = float(np.sqrt(np.mean(residual**2)))
-    if noise is None:
-        return Remainder(rms, None, None, None, None)
-    quiet = last.residual[noise]
-    segment = int(2 ** np.floor(np.log2(quiet.size / 6)))
-    f, power = welch(residual, record.sample_rate_hz, nperseg=segment, detrend="constant")
-    _, floor = welch(quiet, record.sample_rate_hz, nperseg=segment, detrend="constant")
-    edges = np.linspace(1, f.size - 1, 17).astype(int)
-    ratios, ps = [], []
-    for low, high in pairwise(edges.tolist()):
-        ratio = float(power[low:high].sum() / floor[low:high].sum())
-        dof = [
-            max(2.0, 2 * (high - low) * (2 * x.size / segment - 1) * 0.65 / 1.5)
-            for x in (residual, quiet)
-        ]
-        ratios.append(ratio)
-        ps.append(f_tail(ratio, *dof))
-    worst = int(np.argmin(ps))
-    return Remainder(
-        rms=rms,
-        noise_rms=float(np.sqrt(np.mean((quiet - quiet.mean()) ** 2))),
-        chi2_per_dof=float(np.mean(ratios)),
-        p_value=min(1.0, min(ps) * len(ps)),
-        worst_band_hz=(float(f[edges[worst]]), float(f[edges[worst + 1]])),
-    )
-
-
-def _verdict(stages: list[Stage], remainders: tuple[Remainder, ...]) -> Verdict:
-    """Traced: effects were found and what remains is noise. Unexplained: more than noise remains.
-
-    Without a noise stretch the declared model is adequate when nothing could be added, and a
-    remainder cannot be judged: the effects found are then reported as traced.
-    """
-    left = remainders[-1].significant
-    if left:
+def _verdict(outcome: Outcome) -> Verdict:
+    """Traced: terms account for the residual and what remains is noise. Ambiguous: others would do
+    as well. Unexplained: more than noise remains, whatever accounts for a part of it."""
+    if outcome.remainder.significant:
         return "unexplained"
-    return "traced" if len(stages) > 1 else "no_discrepancy"
+    if any(w.rivals for w in outcome.claims):
+        return "ambiguous"
+    return "traced" if outcome.claims else "no_discrepancy"
 
 
-def _new(stages: tuple[Stage, ...], index: int) -> set[str]:
-    return set(stages[index].parameters) - set(stages[index - 1].parameters)
-
-
-def _summary(stage: Stage, remainder: Remainder) -> dict[str, Any]:
+def _summary(stage: Stage, rest: Remainder) -> dict[str, Any]:
     dof = stage.fit.components - stage.fit.theta.size
     return {
         "fit_error": stage.fit_error,
         "validation_error": stage.validation_error,
-        "chi2_per_dof": remainder.chi2_per_dof,
+        "chi2_per_dof": rest.chi2_per_dof,
         "dof": dof,
         "parameters": stage.parameters,
         "fit_rms": stage.fit_rms,

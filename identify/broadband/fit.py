@@ -118,10 +118,13 @@ def fit(
 ) -> Fit:
     """Minimise the whitened simulation error from `start` (every name of the structure).
 
-    Non-convergence is a result (`converged`), not an exception.
+    Non-convergence is a result (`converged`), not an exception; a start whose motion runs away is
+    one too, of infinite `chi2`.
     """
     theta = np.array([start[name] for name in structure.names], dtype=np.float64)
     prediction, jacobian = record.predict(structure, theta)
+    if not np.isfinite(prediction).all():
+        return _runaway(record, structure, theta, whiten)
     weighted = whiten(record.y - prediction)
     chi2, damping, converged, done = float(weighted @ weighted), 1e-6, False, 0
     for done in range(1, iterations + 1):  # noqa: B007
@@ -165,3 +168,12 @@ def fit(
         iterations=done,
         converged=converged,
     )
+
+
+def _runaway(record: Excitation, structure: Structure, theta: FloatArray, whiten: Whitener) -> Fit:
+    """The outcome of a start from which the motion grows without bounds: nothing is fitted."""
+    n, nothing = theta.size, np.zeros(record.samples)
+    return Fit(
+        structure, theta, nothing, record.y, np.zeros((record.samples, n)), np.inf,
+        int(whiten(nothing).size), np.full((n, n), np.inf), 0, False,
+    )  # fmt: skip

@@ -30,7 +30,7 @@ MAX_POWER = 7
 @numba.njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _integrate(w, dw, theta, powers, mu, threshold, h, derivatives):  # type: ignore[no-untyped-def]
     n, m = theta.size, dw.shape[0]
-    friction = 2 if threshold > 0 else 0
+    friction = 2 if threshold != 0 else 0
     rows = n + friction + m if derivatives else 0
     phi = np.zeros(n + friction + m)
     steps = (w.size - 1) // 2

@@ -69,6 +69,24 @@ class Lines:
             if mask.any()
         }
 
+    def differences(self, residual: FloatArray, u: FloatArray, alike: float) -> FloatArray:
+        """What `residual` (samples,) does not repeat where the input `u` does, scaled to the
+        noise's own power: period after period of each excitation that comes back, (samples,).
+
+        Two periods are one excitation where their inputs differ by less than `alike` of their size.
+        """
+        out: list[FloatArray] = []
+        left = list(self.starts)
+        while left:
+            first = u[left[0] : left[0] + self.period]
+            far = alike * np.linalg.norm(first)
+            same = [s for s in left if np.linalg.norm(u[s : s + self.period] - first) <= far]
+            left = [s for s in left if s not in same]
+            if len(same) > 1:
+                blocks = np.array([residual[s : s + self.period] for s in same])
+                out += list((blocks - blocks.mean(axis=0)) * np.sqrt(len(same) / (len(same) - 1)))
+        return np.concatenate(out) if out else np.empty(0)
+
 
 def realisations(first: int, spacing: float, settle: int, period: int, count: int) -> Lines:
     """Lines of `count` realisations `spacing` samples apart, each settled for `settle` samples."""

@@ -252,6 +252,8 @@ def _resonance(u: FloatArray, y: FloatArray, sample_rate_hz: float) -> float:
 def physical(structure: Structure, theta: FloatArray, scale: Scale) -> dict[str, tuple[float, str]]:
     """Scaled parameters as (value, unit) an engineer reads."""
     value = dict(zip(structure.names, theta, strict=True))
+    if value.get("friction_threshold", 1.0) < 0:  # μ tanh(v/s): the same with both signs turned
+        value |= {name: -value[name] for name in FRICTION}
     k = -value["stiffness"]
     root = np.sqrt(abs(k))
     out: dict[str, tuple[float, str]] = {

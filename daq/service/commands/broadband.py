@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from daq.service.commands.common import number, out, table, write_json
 
 
@@ -44,16 +46,24 @@ def diagnose(folder: str, json_: Path | None) -> None:
         ],
     )
     table(
-        "what was added",
-        ("effect", "location", "kind"),
+        "what was added, and what exceeds the noise without it",
+        ("effect", "location", "kind", "without it", "claimed", "does as well"),
         [
-            (s.added.candidate.effect, s.added.candidate.location, s.added.candidate.kind)
-            for s in found.stages
-            if s.added is not None
+            (
+                w.score.candidate.effect,
+                w.score.candidate.location,
+                w.score.candidate.kind,
+                f"{number(w.without, 3)} times" if np.isfinite(w.without) else "all of it",
+                "yes" if w in found.claims else "no",
+                ", ".join(w.rivals),
+            )
+            for w in found.weighed
         ],
     )
     rest = found.remainder
-    noise = "unknown" if rest.noise_rms is None else f"{number(rest.noise_rms, 3)} {found.unit}"
+    noise = "unknown"
+    if rest.noise_rms is not None:
+        noise = f"{number(rest.noise_rms, 3)} {found.unit} ({rest.noise_source})"
     out.print(
         f"verdict {found.verdict}: {number(rest.rms, 3)} {found.unit} are left, noise is {noise} "
         f"({found.seconds:.0f} s)",
