@@ -11,7 +11,7 @@ TRUTH = {
     "mode1.frequency_hz": 70.0,
     "mode1.damping": 0.05,
     "static_gain": 1.0,
-    "bias_v": 0.0,
+    "bias": 0.0,
     "nonlinearity.c3": 4.0,
 }
 

@@ -78,6 +78,7 @@ class BroadbandRecord:
     noise: slice | None
     period_samples: int | None
     period_starts: tuple[int, ...]
+    units: tuple[str, str]  # of drive and response
 
 
 def is_broadband(path: str | Path) -> bool:
@@ -144,4 +145,5 @@ def read_broadband(path: str | Path) -> BroadbandRecord:
         None if table.noise is None else stretch("noise", table.noise),
         table.period_samples,
         tuple(table.period_starts),
+        (card.channels[drive].unit, card.channels[1 - drive].unit),
     )

@@ -9,7 +9,8 @@ coloured residual demands. What is left is judged against the noise (`rest`).
 """
 
 import time
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -21,7 +22,7 @@ from identify.broadband.claims import Outcome, Step, Weighed, weigh
 from identify.broadband.fit import Fit, Whitener, fit
 from identify.broadband.lines import Lines
 from identify.broadband.model import LINEAR, Excitation, Structure
-from identify.broadband.rest import SIGNIFICANT, Remainder, noise_of, remainder
+from identify.broadband.rest import SIGNIFICANT, Noise, Remainder, noise_of, remainder
 
 FloatArray = npt.NDArray[np.float64]
 Declared = Literal["linear", "cubic", "cubic_quadratic"]
@@ -68,10 +69,23 @@ class BroadbandDiagnosis:
     remainder: Remainder
     remainders: tuple[Remainder, ...]
     seconds: float
-    unit: str = "V"
+    record: Excitation
+    estimation: slice
+    test: slice
+    noise: Noise | None
     title: str = ""
-    test_scale: float = 1.0
-    notes: tuple[str, ...] = field(default=())
+    warm_up: int = 50
+
+    @property
+    def unit(self) -> str:
+        """Of the response and of every error."""
+        return self.record.scale.output_unit
+
+    @property
+    def test_scale(self) -> float:
+        """RMS of the response that the test counts."""
+        y = self.record.y[self.test][self.warm_up :]
+        return float(np.sqrt(np.mean(y**2)))
 
     def to_json(self) -> dict[str, Any]:
         """The `diagnosis/1` object; `stages` and `remainder` go beyond the contract."""
@@ -125,7 +139,6 @@ class BroadbandDiagnosis:
                 "significant": self.remainder.significant,
                 "worst_band_hz": self.remainder.worst_band_hz,
             },
-            "notes": list(self.notes),
         }
 
     def _own(self, score: Score) -> dict[str, dict[str, float | str]]:
@@ -159,28 +172,33 @@ def diagnose_broadband(
     max_effects: int = 6,
     warm_up: int = 50,
     title: str = "",
+    units: tuple[str, str] = ("V", "V"),
+    progress: Callable[[float, str], None] | None = None,
 ) -> BroadbandDiagnosis:
     """Fit the declared oscillator, then find what it lacks.
 
     Parameters
     ----------
-    u, y : one continuous record of input and output, shape (samples,), V. It is simulated whole,
-        from rest.
+    u, y : one continuous record of input and output, shape (samples,), in `units`. It is
+        simulated whole, from rest.
     estimation, test : samples that are fitted, and samples that are only predicted; of the test's
         first `warm_up` samples the initial state is taken, and they do not count.
     lines : whole periods of a periodic excitation within `estimation`, for the split by lines.
     noise : a weakly excited stretch outside both, whose residual is noise.
+    progress : called with the share done and what is being done.
 
     Raises
     ------
     ValueError : overlapping slices, an unknown declared model, unusable arrays.
     """
     began = time.perf_counter()
-    record = Excitation.of(u, y, sample_rate_hz)
+    tell = progress or (lambda share, text: None)
+    record = Excitation.of(u, y, sample_rate_hz, units)
     if declared not in _DECLARED:
         raise ValueError(f"declared={declared!r} is not one of {sorted(_DECLARED)}")
     estimation, test = _checked(record, estimation, test)
     plain = Whitener.plain(estimation)
+    tell(0.0, "fitting the declared model")
     start = {name: _STARTS.get(name, 0.0) for name in LINEAR}
     start["input"] = record.scale.input / record.scale.output
     linear = fit(record, Structure(LINEAR), start, plain)
@@ -189,6 +207,7 @@ def diagnose_broadband(
     record, current = _resolved(record, current, plain)
     stages = [_stage(record, current, None, estimation, test, lines, warm_up)]
     while True:
+        tell(0.7 * len(stages) / (max_effects + 2), f"fit {len(stages)}: what it lacks")
         whiten = Whitener.of(stages[-1].fit.residual, estimation)
         scores = tuple(score_test(record, stages[-1].fit, whiten))
         stages[-1] = _with_scores(stages[-1], scores)
@@ -206,11 +225,12 @@ def diagnose_broadband(
         for before, after in pairwise(stages)
         if after.added is not None
     ]
+    tell(0.7, "leaving each term out again")
     outcome = weigh(record, steps, stages[0].fit, estimation, known)
     final = stages[-1]
     if outcome.fit.structure != final.fit.structure:
         final = _stage(record, outcome.fit, None, estimation, test, lines, warm_up)
-    test_y = record.y[test.start + warm_up : test.stop]
+    tell(1.0, "done")
     return BroadbandDiagnosis(
         declared=declared,
         stages=tuple(stages),
@@ -221,8 +241,12 @@ def diagnose_broadband(
         remainder=outcome.remainder,
         remainders=tuple(remainder(record, s.fit, estimation, outcome.noise) for s in stages),
         seconds=time.perf_counter() - began,
+        record=record,
+        estimation=estimation,
+        test=test,
+        noise=outcome.noise,
         title=title,
-        test_scale=float(np.sqrt(np.mean(test_y**2))),
+        warm_up=warm_up,
     )
 
 

@@ -4,7 +4,7 @@
 
 `NAMES` lists every parameter that a structure may hold; a `Structure` is the set in use. The
 simulation runs in scaled, dimensionless coefficients (`kernel`); `physical` translates them, with
-their covariance, into hertz, ratios and volts.
+their covariance, into hertz, ratios and the channels' units.
 """
 
 from dataclasses import dataclass, field, replace
@@ -60,11 +60,13 @@ class Structure:
 
 @dataclass(frozen=True)
 class Scale:
-    """Units of the dimensionless equation: time 1/rate, output and input in volts."""
+    """Units of the dimensionless equation: time 1/rate, output and input in their own units."""
 
     rate: float
     output: float
     input: float
+    output_unit: str = "V"
+    input_unit: str = "V"
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,14 @@ class Excitation:
     substeps: int = _RECORDED
 
     @classmethod
-    def of(cls, u: npt.ArrayLike, y: npt.ArrayLike, sample_rate_hz: float) -> "Excitation":
-        """Check and scale a record; ω₀'s scale is where |Y/U| is largest.
+    def of(
+        cls,
+        u: npt.ArrayLike,
+        y: npt.ArrayLike,
+        sample_rate_hz: float,
+        units: tuple[str, str] = ("V", "V"),
+    ) -> "Excitation":
+        """Check and scale a record; ω₀'s scale is where |Y/U| is largest. `units` of u and y.
 
         Raises
         ------
@@ -102,7 +110,7 @@ class Excitation:
         if u.size % 2:
             u, y = u[:-1], y[:-1]
         rate = 2 * np.pi * _resonance(u, y, sample_rate_hz)
-        scale = Scale(rate, float(y.std()), float(u.std()))
+        scale = Scale(rate, float(y.std()), float(u.std()), units[1], units[0])
         return cls(u, y, sample_rate_hz, scale, np.fft.rfft(u))
 
     @property
@@ -168,8 +176,8 @@ class Excitation:
         """The record with as many steps a sample as keep the integration error's RMS small.
 
         Richardson: the fourth-order error at n steps is 16/15 of the change from n to 2n. It must
-        stay below `tolerance` (V), or what is measured well enough would show the integrator's
-        error as an effect. At most 16 steps.
+        stay below `tolerance`, in the output's unit, or what is measured well enough would show the
+        integrator's error as an effect. At most 16 steps.
         """
         record = self
         coarse, _ = record.predict(structure, theta, derivatives=False)
@@ -260,32 +268,44 @@ def physical(structure: Structure, theta: FloatArray, scale: Scale) -> dict[str,
         "mode1.frequency_hz": (scale.rate * root / (2 * np.pi), "Hz"),
         "mode1.damping": (-value["damping"] / (2 * root), "1"),
     }
-    volts = scale.output
+    size, into, out_of = scale.output, scale.input_unit, scale.output_unit
     table = {
-        "input": ("static_gain", volts / scale.input / k, "V/V"),
-        "bias": ("bias_v", volts / k, "V"),
-        "quadratic": ("nonlinearity.c2", -1 / (k * volts), "1/V"),
-        "cubic": ("nonlinearity.c3", -1 / (k * volts**2), "1/V^2"),
-        "quartic": ("nonlinearity.c4", -1 / (k * volts**3), "1/V^3"),
-        "quintic": ("nonlinearity.c5", -1 / (k * volts**4), "1/V^4"),
-        "damping_y2": ("nonlinear_damping.y2", 1 / (value["damping"] * volts**2), "1/V^2"),
+        "input": ("static_gain", size / scale.input / k, f"{out_of}/{into}"),
+        "bias": ("bias", size / k, out_of),
+        "quadratic": ("nonlinearity.c2", -1 / (k * size), f"1/{out_of}"),
+        "cubic": ("nonlinearity.c3", -1 / (k * size**2), f"1/{out_of}^2"),
+        "quartic": ("nonlinearity.c4", -1 / (k * size**3), f"1/{out_of}^3"),
+        "quintic": ("nonlinearity.c5", -1 / (k * size**4), f"1/{out_of}^4"),
+        "damping_y2": (
+            "nonlinear_damping.y2",
+            1 / (value["damping"] * size**2),
+            f"1/{out_of}^2",
+        ),
         "damping_v3": (
             "nonlinear_damping.v2",
-            1 / (value["damping"] * (volts * scale.rate) ** 2),
-            "s^2/V^2",
+            1 / (value["damping"] * (size * scale.rate) ** 2),
+            f"s^2/{out_of}^2",
         ),
-        "input_square": ("actuator_nonlinearity.c2", 1 / (value["input"] * scale.input), "1/V"),
-        "input_cube": ("actuator_nonlinearity.c3", 1 / (value["input"] * scale.input**2), "1/V^2"),
-        "friction": ("nonlinear_damping.friction_v", -volts / k, "V"),
+        "input_square": (
+            "actuator_nonlinearity.c2",
+            1 / (value["input"] * scale.input),
+            f"1/{into}",
+        ),
+        "input_cube": (
+            "actuator_nonlinearity.c3",
+            1 / (value["input"] * scale.input**2),
+            f"1/{into}^2",
+        ),
+        "friction": ("nonlinear_damping.friction", -size / k, out_of),
         "friction_threshold": (
-            "nonlinear_damping.threshold_v_per_s",
-            volts * scale.rate,
-            "V/s",
+            "nonlinear_damping.threshold",
+            size * scale.rate,
+            f"{out_of}/s",
         ),
         "delay": ("input_delay_s", 1.0, "s"),
         "recorder_edge": ("recorder.edge_hz", 1.0, "Hz"),
         "recorder_dispersion": ("recorder.dispersion_rad", 1.0, "rad"),
-        "feedthrough": ("feedthrough", 1.0, "V/V"),
+        "feedthrough": ("feedthrough", 1.0, f"{out_of}/{into}"),
     }
     for name, (label, factor, unit) in table.items():
         if name in value:

@@ -137,12 +137,13 @@ def diagnose(
     from daq.importers.broadband import is_broadband
 
     if is_broadband(campaign):
+        with progress_bar(str(json_) == "-") as tell:
+            traced = broadband.diagnose(campaign, tell)
+        write_json(json_, traced.to_json())
         if html is not None:
-            raise InputError(
-                f"--html {html}: a campaign with broadband excitation has no HTML report; "
-                "leave it out, --json holds everything"
-            )
-        broadband.diagnose(campaign, json_)
+            broadband.report(html, traced)
+        if str(json_) != "-":
+            broadband.show(traced)
         return
     from identify.diagnosis import diagnose as run
     from identify.executor import executor

@@ -1,14 +1,19 @@
 """`entrain diagnose` of a campaign with broadband excitation."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from daq.service.commands.common import number, out, table, write_json
+from daq.service.commands.common import number, out, table
+
+if TYPE_CHECKING:
+    from identify.broadband import BroadbandDiagnosis
 
 
-def diagnose(folder: str, json_: Path | None) -> None:
-    """Add effects to the declared oscillator as long as the residual asks for them; print each."""
+def diagnose(folder: str, progress: Callable[[float, str], None]) -> "BroadbandDiagnosis":
+    """Add effects to the declared oscillator as long as the residual asks for them."""
     from daq.importers.broadband import read_broadband
     from identify.broadband import Lines, diagnose_broadband
 
@@ -16,7 +21,7 @@ def diagnose(folder: str, json_: Path | None) -> None:
     lines = None
     if record.period_samples is not None and record.period_starts:
         lines = Lines(record.period_starts, record.period_samples)
-    found = diagnose_broadband(
+    return diagnose_broadband(
         record.drive,
         record.response,
         record.sample_rate_hz,
@@ -26,10 +31,22 @@ def diagnose(folder: str, json_: Path | None) -> None:
         lines=lines,
         noise=record.noise,
         title=record.title,
+        units=record.units,
+        progress=progress,
     )
-    write_json(json_, found.to_json())
-    if str(json_) == "-":
-        return
+
+
+def report(path: Path, found: "BroadbandDiagnosis") -> None:
+    """Write the HTML report."""
+    from identify.report.broadband import write_broadband_html
+
+    write_broadband_html(path, found)
+
+
+def show(found: "BroadbandDiagnosis") -> None:
+    """Print the errors term by term, what each term is worth, and the verdict with its evidence."""
+    from identify.report.broadband import evidence, headline
+
     kept = [name for name in ("odd_excited", "even") if name in found.stages[0].lines_rms]
     table(
         f"simulation error, RMS ({found.unit})",
@@ -60,12 +77,6 @@ def diagnose(folder: str, json_: Path | None) -> None:
             for w in found.weighed
         ],
     )
-    rest = found.remainder
-    noise = "unknown"
-    if rest.noise_rms is not None:
-        noise = f"{number(rest.noise_rms, 3)} {found.unit} ({rest.noise_source})"
-    out.print(
-        f"verdict {found.verdict}: {number(rest.rms, 3)} {found.unit} are left, noise is {noise} "
-        f"({found.seconds:.0f} s)",
-        markup=False,
-    )
+    out.print(f"{headline(found)} ({found.seconds:.0f} s)", markup=False)
+    for line in evidence(found):
+        out.print(f"  {line}", markup=False)
