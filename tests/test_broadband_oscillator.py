@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -155,18 +156,22 @@ def test_lines_tell_even_from_odd() -> None:
 
 
 @pytest.mark.parametrize(
-    ("estimation", "test", "message"),
+    ("parts", "message"),
     [
-        (slice(0, 3000), slice(2000, 4000), "overlap"),
-        (slice(0, 100), slice(2000, 4000), "shorter"),
+        ({"estimation": slice(0, 3000)}, r"estimation=\[0, 3000\] and test=\[2000, 4000\] overlap"),
+        ({"estimation": slice(0, 100)}, r"estimation=\[0, 100\] is shorter than 512"),
+        ({"noise": slice(4000, 4050)}, r"noise=\[4000, 4050\] is shorter than 256"),
+        ({"lines": Lines((0, 3000), 2048)}, "2048 samples from 3000 on is not within"),
+        ({"declared": "quartic"}, "declared='quartic'"),
     ],
 )
-def test_bad_splits_are_refused(
-    duffing: tuple[FloatArray, FloatArray], estimation: slice, test: slice, message: str
+def test_bad_settings_are_refused(
+    duffing: tuple[FloatArray, FloatArray], parts: dict[str, Any], message: str
 ) -> None:
     u, y = duffing
+    settings: dict[str, Any] = {"estimation": slice(0, 2000), "test": slice(2000, 4000)} | parts
     with pytest.raises(ValueError, match=message):
-        diagnose_broadband(u, y, RATE, estimation=estimation, test=test)
+        diagnose_broadband(u, y, RATE, **settings)
 
 
 @pytest.mark.no_cover

@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.cli import app
+from daq.errors import InputError
 from identify.broadband import BroadbandDiagnosis, Lines, diagnose_broadband
 from identify.report.broadband import broadband_html, evidence, headline
 from tests.broadband_material import RATE, duffing_output, multisine
@@ -85,6 +86,15 @@ def test_what_was_not_claimed_is_not_shown_as_found() -> None:
     assert "Tried and not claimed" in reader.text
     assert "Next experiment" in reader.headings
     assert "Restoring force" not in reader.headings
+
+
+def test_the_command_names_what_it_cannot_use(tmp_path: Path) -> None:
+    u = multisine(3 * PERIOD, 1)
+    values = np.c_[u, duffing_output(u)]
+    np.savetxt(tmp_path / "recording.csv", values, delimiter=",", header="u,y", comments="")
+    (tmp_path / "campaign.toml").write_text(CARD.replace("[4096, 6144]", "[4000, 6144]"))
+    with pytest.raises(InputError, match=r"test=\[4000, 6144\] overlap"):
+        CliRunner().invoke(app, ["diagnose", str(tmp_path)], catch_exceptions=False)
 
 
 def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from identify.broadband.candidates import Score
 from identify.broadband.fit import Fit, Whitener, fit
 from identify.broadband.model import Excitation, Structure
-from identify.broadband.rest import Noise, Remainder, remainder
+from identify.broadband.rest import UNPREDICTED, Noise, Remainder, remainder
 
 ACCOUNTS = 3.0  # times the excess over noise that must be left without a term
 NEAR = 0.5  # share of a term's own score from which another candidate is fitted in its place
@@ -125,7 +125,7 @@ def weigh(
     best = steps[-1].after if steps else declared
     rest = remainder(record, best, estimation, noise)
     if noise is None and not rest.significant:
-        noise = Noise(best.residual[estimation], "residual that the motion does not predict")
+        noise = Noise(best.residual[estimation], UNPREDICTED)
     judge = _Judge(record, declared, estimation, noise)
     weighed = [Weighed(s.score, judge.ratio(s.before, s.after)) for s in steps]
     kept = list(range(len(steps)))

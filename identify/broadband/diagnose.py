@@ -29,6 +29,7 @@ Declared = Literal["linear", "cubic", "cubic_quadratic"]
 Verdict = Literal["no_discrepancy", "traced", "ambiguous", "unexplained"]
 
 MATERIAL = 0.005  # least relative fall of the estimation RMS that counts as an effect
+PART_SAMPLES, NOISE_SAMPLES = 512, 256  # at least
 _INTEGRATION = 0.05  # integration error over residual, RMS: half of MATERIAL as a share
 _DECLARED: dict[str, tuple[str, ...]] = {
     "linear": LINEAR,
@@ -189,14 +190,15 @@ def diagnose_broadband(
 
     Raises
     ------
-    ValueError : overlapping slices, an unknown declared model, unusable arrays.
+    ValueError : stretches that overlap or are short, periods beyond the record, an unknown declared
+        model, unusable arrays.
     """
     began = time.perf_counter()
     tell = progress or (lambda share, text: None)
     record = Excitation.of(u, y, sample_rate_hz, units)
     if declared not in _DECLARED:
         raise ValueError(f"declared={declared!r} is not one of {sorted(_DECLARED)}")
-    estimation, test = _checked(record, estimation, test)
+    estimation, test = _checked(record, estimation, test, lines, noise)
     plain = Whitener.plain(estimation)
     tell(0.0, "fitting the declared model")
     start = {name: _STARTS.get(name, 0.0) for name in LINEAR}
@@ -250,13 +252,33 @@ def diagnose_broadband(
     )
 
 
-def _checked(record: Excitation, *parts: slice) -> tuple[slice, slice]:
-    whole = [slice(*p.indices(record.samples)[:2]) for p in parts]
+def _checked(
+    record: Excitation, estimation: slice, test: slice, lines: Lines | None, noise: slice | None
+) -> tuple[slice, slice]:
+    whole = [slice(*p.indices(record.samples)[:2]) for p in (estimation, test)]
+    named = dict(zip(("estimation", "test"), whole, strict=True))
+    if noise is not None:
+        named["noise"] = slice(*noise.indices(record.samples)[:2])
+    for name, part in named.items():
+        least = NOISE_SAMPLES if name == "noise" else PART_SAMPLES
+        if part.stop - part.start < least:
+            raise ValueError(
+                f"{name}=[{part.start}, {part.stop}] is shorter than {least} samples; name a "
+                "longer stretch"
+            )
     first, second = whole
-    if min(p.stop - p.start for p in whole) < 512:
-        raise ValueError(f"estimation={first} or test={second} is shorter than 512 samples")
     if max(first.start, second.start) < min(first.stop, second.stop):
-        raise ValueError(f"estimation={first} and test={second} overlap: they must be disjoint")
+        raise ValueError(
+            f"estimation=[{first.start}, {first.stop}] and test=[{second.start}, {second.stop}] "
+            "overlap: they must be disjoint"
+        )
+    starts, period = ((), 0) if lines is None else (lines.starts, lines.period)
+    for start in starts:
+        if not 0 <= start <= record.samples - period:
+            raise ValueError(
+                f"period_starts: a period of {period} samples from {start} on is not within "
+                f"the {record.samples} samples recorded"
+            )
     return first, second
 
 

@@ -28,6 +28,7 @@ FloatArray = npt.NDArray[np.float64]
 SIGNIFICANT = 1e-3
 ALIKE = 0.02  # relative difference below which two periods of the input are one excitation
 BANDS = 16
+UNPREDICTED = "residual that the motion does not predict"  # a source of noise, for want of better
 FOLDS = 20  # stretches of the cross-validation
 LAGS = 24  # samples of the past of u that the regression may use
 DEGREE = 3  # of the products of y, y′ and u

@@ -16,6 +16,7 @@ from scipy.signal import welch
 from identify.broadband import BroadbandDiagnosis
 from identify.broadband.diagnose import Stage
 from identify.broadband.model import MONOMIALS
+from identify.broadband.rest import UNPREDICTED
 from identify.parameters import Estimate
 from identify.report import theme
 from identify.report.page import drawing, page, paragraphs, section, table, tag, text
@@ -76,6 +77,10 @@ def evidence(found: BroadbandDiagnosis) -> list[str]:
         lines.append(
             f"The noise is unknown. Of what is left, {percent(rest.follows)} of the power follows "
             f"the motion ({p_is(rest.p_value or 0.0)})."
+        )
+    elif rest.noise_source == UNPREDICTED and not rest.significant:
+        lines.append(
+            "The noise is unknown: what is left does not follow the motion, and counts as noise."
         )
     else:
         assert rest.chi2_per_dof is not None

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from daq.errors import InputError
 from daq.service.commands.common import number, out, table
 
 if TYPE_CHECKING:
@@ -21,19 +22,22 @@ def diagnose(folder: str, progress: Callable[[float, str], None]) -> "BroadbandD
     lines = None
     if record.period_samples is not None and record.period_starts:
         lines = Lines(record.period_starts, record.period_samples)
-    return diagnose_broadband(
-        record.drive,
-        record.response,
-        record.sample_rate_hz,
-        declared=record.feedback,
-        estimation=record.estimation,
-        test=record.test,
-        lines=lines,
-        noise=record.noise,
-        title=record.title,
-        units=record.units,
-        progress=progress,
-    )
+    try:
+        return diagnose_broadband(
+            record.drive,
+            record.response,
+            record.sample_rate_hz,
+            declared=record.feedback,
+            estimation=record.estimation,
+            test=record.test,
+            lines=lines,
+            noise=record.noise,
+            title=record.title,
+            units=record.units,
+            progress=progress,
+        )
+    except ValueError as error:  # stretches and samples that cannot be used
+        raise InputError(f"{folder}: {error}") from error
 
 
 def report(path: Path, found: "BroadbandDiagnosis") -> None:
