@@ -108,7 +108,7 @@ def score_test(record: Excitation, fitted: Fit, whiten: Whitener) -> list[Score]
     for c in free:
         s = whiten(np.column_stack([column[name] for name in c.probe]))
         size = np.linalg.norm(s, axis=0)
-        s = s / size
+        s = s / np.where(size > 0, size, 1.0)
         s = s - basis @ (basis.T @ s)
         left = float(np.linalg.norm(s))
         q, _ = np.linalg.qr(s)

@@ -50,6 +50,12 @@ class Outcome:
         sure = (w for w in self.weighed if w.accounts)
         return tuple(w for w in sure if not (w.rivals and self.remainder.significant))
 
+    def nothing_claimed(self, record: Excitation, declared: Fit, estimation: slice) -> "Outcome":
+        """The same with every term dropped, whatever it accounts for."""
+        weighed = tuple(replace(w, without=0.0, rivals=()) for w in self.weighed)
+        rest = remainder(record, declared, estimation, self.noise)
+        return Outcome(declared, weighed, self.noise, rest)
+
 
 @dataclass(frozen=True)
 class Step:

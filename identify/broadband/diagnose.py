@@ -22,7 +22,9 @@ from identify.broadband.claims import Outcome, Step, Weighed, weigh
 from identify.broadband.fit import Fit, Whitener, fit
 from identify.broadband.lines import Lines
 from identify.broadband.model import LINEAR, Excitation, Structure
+from identify.broadband.quality import quality, spoilt
 from identify.broadband.rest import SIGNIFICANT, Noise, Remainder, noise_of, remainder
+from identify.results import QualityFlag
 
 FloatArray = npt.NDArray[np.float64]
 Declared = Literal["linear", "cubic", "cubic_quadratic"]
@@ -66,6 +68,7 @@ class BroadbandDiagnosis:
     final: Stage
     weighed: tuple[Weighed, ...]
     claims: tuple[Weighed, ...]
+    quality: tuple[QualityFlag, ...]
     verdict: Verdict
     remainder: Remainder
     remainders: tuple[Remainder, ...]
@@ -97,7 +100,7 @@ class BroadbandDiagnosis:
             "campaign": self.title,
             "declared_model": {"structure": self.declared, "excitation": "broadband"},
             "seconds": self.seconds,
-            "quality": [],
+            "quality": [q.to_json() for q in self.quality],
             "noise_floor": None if noise is None else noise / self.test_scale,
             "before": _summary(first, self.remainders[0]),
             "residual": {
@@ -229,6 +232,9 @@ def diagnose_broadband(
     ]
     tell(0.7, "leaving each term out again")
     outcome = weigh(record, steps, stages[0].fit, estimation, known)
+    flags = quality(record, stages[0].fit, stages[-1].fit, estimation, lines, title)
+    if spoilt(flags):
+        outcome = outcome.nothing_claimed(record, stages[0].fit, estimation)
     final = stages[-1]
     if outcome.fit.structure != final.fit.structure:
         final = _stage(record, outcome.fit, None, estimation, test, lines, warm_up)
@@ -239,7 +245,8 @@ def diagnose_broadband(
         final=final,
         weighed=outcome.weighed,
         claims=outcome.claims,
-        verdict=_verdict(outcome),
+        quality=flags,
+        verdict=_verdict(outcome, flags),
         remainder=outcome.remainder,
         remainders=tuple(remainder(record, s.fit, estimation, outcome.noise) for s in stages),
         seconds=time.perf_counter() - began,
@@ -363,10 +370,11 @@ def _with_scores(stage: Stage, scores: tuple[Score, ...]) -> Stage:
     return Stage(**{**stage.__dict__, "scores": scores})
 
 
-def _verdict(outcome: Outcome) -> Verdict:
+def _verdict(outcome: Outcome, flags: tuple[QualityFlag, ...]) -> Verdict:
     """Traced: terms account for the residual and what remains is noise. Ambiguous: others would do
-    as well. Unexplained: more than noise remains, whatever accounts for a part of it."""
-    if outcome.remainder.significant:
+    as well. Unexplained: more than noise remains, whatever accounts for a part of it; or the
+    recording is spoilt, and says nothing."""
+    if outcome.remainder.significant or spoilt(flags):
         return "unexplained"
     if any(w.rivals for w in outcome.claims):
         return "ambiguous"

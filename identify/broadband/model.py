@@ -240,8 +240,9 @@ class Excitation:
 def _through(column: FloatArray, response: ComplexArray) -> FloatArray:
     if not np.isfinite(column[-1]):
         return np.full((column.size - 1) // _RECORDED, np.nan)
-    spectrum = np.fft.rfft(column[:-1]) * response
-    return np.asarray(np.fft.irfft(spectrum, column.size - 1)[::_RECORDED])
+    with np.errstate(over="ignore", invalid="ignore"):  # sensitivities of a start that runs away
+        spectrum = np.fft.rfft(column[:-1]) * response
+        return np.asarray(np.fft.irfft(spectrum, column.size - 1)[::_RECORDED])
 
 
 def _resonance(u: FloatArray, y: FloatArray, sample_rate_hz: float) -> float:

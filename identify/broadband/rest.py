@@ -7,7 +7,7 @@ Three ways to know the noise, the best one that the record allows:
 - neither: the noise is unknown, but noise does not follow the motion. A generic regression of the
   residual on products of the simulated y, y′ and u, each also passed through the resonance, is
   tried on stretches that it was not fitted to (cross-validation). What it predicts there is no
-  noise; what it does not predict may be either, and no noise level is taken from it.
+  noise; what it does not predict is taken for noise only where it is as large all the time.
 """
 
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ class Remainder:
     """A residual against noise: RMS of both, worst band, and the corrected p of that band.
 
     Where the noise is unknown, `follows` is the share of the residual's power that the motion
-    predicts, and p that of this share being luck.
+    predicts, and p that of noise being so well predicted or so uneven.
     """
 
     rms: float
@@ -87,7 +87,8 @@ def remainder(record: Excitation, fitted: Fit, estimation: slice, noise: Noise |
     rms = float(np.sqrt(np.mean(residual**2)))
     if noise is None:
         share, p = follows_motion(record, fitted, estimation)
-        return Remainder(rms, p_value=p, follows=share)
+        uneven, _ = unevenness(residual, record.y[estimation], record.sample_rate_hz)
+        return Remainder(rms, p_value=min(1.0, 2 * min(p, uneven)), follows=share)
     ratio, p, band = _against(residual, noise.samples, record.sample_rate_hz)
     return Remainder(rms, noise.rms, noise.source, ratio, p, band)
 
@@ -119,9 +120,36 @@ def _against(
     return float(np.mean(ratios)), min(1.0, min(ps) * len(ps)), band
 
 
+def stretches(samples: int) -> list[slice]:
+    """The stretches in which a residual is looked at."""
+    edges = np.linspace(0, samples, FOLDS + 1).astype(int)
+    return [slice(a, b) for a, b in pairwise(edges.tolist())]
+
+
+def unevenness(residual: FloatArray, motion: FloatArray, rate: float) -> tuple[float, int]:
+    """How probable it is that noise of one power, or of one share of the `motion`, is so uneven
+    over the stretches, and where it is largest.
+
+    Each stretch's power against the median one: an F statistic with as many degrees of freedom as
+    the residual's bandwidth allows, 2·B·T with B = (∫S)²/∫S²; Bonferroni-corrected.
+    """
+    parts = stretches(residual.size)
+    power = np.array([np.mean(residual[p] ** 2) for p in parts])
+    moved = np.array([np.mean(motion[p] ** 2) for p in parts])
+    f, density = welch(residual, rate, nperseg=min(1024, residual.size // 8))
+    width = float(density.sum() ** 2 / max(float(np.sum(density**2)), 1e-300)) * float(f[1])
+    dof = max(2.0, 2 * width * residual.size / FOLDS / rate)
+    chances = []
+    for size in (power, power / np.maximum(moved, 1e-300)):
+        ratio = float(size.max() / max(float(np.median(size)), 1e-300))
+        chances.append(FOLDS * f_tail(ratio, dof, dof * FOLDS / 2))
+    return min(1.0, max(chances)), int(np.argmax(power))
+
+
 def follows_motion(record: Excitation, fitted: Fit, where: slice) -> tuple[float, float]:
     """Share of the residual's power that products of the motion predict where they were not
-    fitted: the median over stretches, and how probable it is by luck that so many gain.
+    fitted, and how probable so much is by luck: of the whole record and of each half, in which a
+    loop that changes once is one loop; the likeliest of the three to be no luck.
 
     Noise that the motion does not know is not predicted, whatever its colour: a stretch then loses.
     """
@@ -129,12 +157,21 @@ def follows_motion(record: Excitation, fitted: Fit, where: slice) -> tuple[float
     columns = _motion(record, fitted)[where]
     columns = columns - columns.mean(axis=0)
     columns /= np.linalg.norm(columns, axis=0) + 1e-300
-    edges = np.linspace(0, residual.size, FOLDS + 1).astype(int)
-    parts = [slice(a, b) for a, b in pairwise(edges.tolist())]
+    middle = residual.size // 2
+    parts = (slice(0, residual.size), slice(0, middle), slice(middle, residual.size))
+    found = [_predicted(residual[p], columns[p]) for p in parts]
+    share, p_value = min(found, key=lambda item: (item[1], -item[0]))
+    return share, min(1.0, len(parts) * p_value)
+
+
+def _predicted(residual: FloatArray, columns: FloatArray) -> tuple[float, float]:
+    """Share of the power of `residual` (samples,) that a regression on `columns` (samples, n)
+    predicts where it was not fitted: the median over stretches; and the sign test's p."""
+    parts = stretches(residual.size)
     normal = [columns[p].T @ columns[p] for p in parts]
     right = [columns[p].T @ residual[p] for p in parts]
-    ridge = 1e-6 * np.eye(columns.shape[1])
     together, total = np.sum(normal, axis=0), np.sum(right, axis=0)
+    ridge = 1e-6 * np.eye(columns.shape[1])
     gains = []
     for part, own, mine in zip(parts, normal, right, strict=True):
         weights = np.linalg.solve(together - own + ridge, total - mine)

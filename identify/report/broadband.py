@@ -16,6 +16,7 @@ from scipy.signal import welch
 from identify.broadband import BroadbandDiagnosis
 from identify.broadband.diagnose import Stage
 from identify.broadband.model import MONOMIALS
+from identify.broadband.quality import spoilt
 from identify.broadband.rest import UNPREDICTED
 from identify.parameters import Estimate
 from identify.report import theme
@@ -40,6 +41,7 @@ def broadband_html(found: BroadbandDiagnosis) -> str:
     return page(
         f"entrain: {found.title}",
         _verdict(found),
+        section("Recording", _quality(found)),
         section("Error, term by term", _stages(found), _errors_drawn(found)),
         section("Residual", _spectrum_drawn(found), _motion_drawn(found), _lines(found)),
         section("Terms left out again", _weighed(found)),
@@ -89,6 +91,8 @@ def evidence(found: BroadbandDiagnosis) -> list[str]:
             f"has {scientific(rest.chi2_per_dof)} times its power ({p_is(rest.p_value or 0.0)})"
             f"{_most(found)}."
         )
+    if spoilt(found.quality):
+        lines.append("The recording is spoilt (see below): nothing is claimed from it.")
     tried = [w.score.candidate.kind for w in found.weighed if w not in found.claims]
     if tried:
         lines.append(f"Tried and not claimed: {joined(tuple(tried))}.")
@@ -142,6 +146,11 @@ def _stages(found: BroadbandDiagnosis) -> str:
     if sets:
         note += f" The last columns split the fitted samples' error by lines ({unit})."
     return table(head, rows, note, numeric=range(1, len(head)))
+
+
+def _quality(found: BroadbandDiagnosis) -> str:
+    rows = [[q.flag.replace("_", " "), q.severity, q.detail] for q in found.quality]
+    return table(["flag", "consequence", "detail"], rows) if rows else ""
 
 
 def _weighed(found: BroadbandDiagnosis) -> str:

@@ -81,6 +81,8 @@ def show(found: "BroadbandDiagnosis") -> None:
             for w in found.weighed
         ],
     )
+    for flag in found.quality:
+        out.print(f"{flag.flag} ({flag.severity}): {flag.detail}", markup=False)
     out.print(f"{headline(found)} ({found.seconds:.0f} s)", markup=False)
     for line in evidence(found):
         out.print(f"  {line}", markup=False)
