@@ -1,10 +1,9 @@
 """`entrain diagnose` of a campaign with broadband excitation."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from daq.errors import InputError
 from daq.service.commands.common import number, out, table
@@ -74,7 +73,7 @@ def show(found: "BroadbandDiagnosis") -> None:
                 w.score.candidate.effect,
                 w.score.candidate.location,
                 w.score.candidate.kind,
-                f"{number(w.without, 3)} times" if np.isfinite(w.without) else "all of it",
+                f"{number(w.without, 3)} times" if math.isfinite(w.without) else "all of it",
                 "yes" if w in found.claims else "no",
                 ", ".join(w.rivals),
             )
