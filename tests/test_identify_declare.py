@@ -102,5 +102,19 @@ def test_tails_and_ranks_are_scipy_s() -> None:
     for x, k in ((0.4, 3.0), (88.2, 61.4), (900.0, 5.0), (-1.0, 2.0)):
         assert chi2_tail(x, k) == pytest.approx(stats.chi2.sf(x, k), rel=1e-10)
     assert f_tail(2.2, 3, 40) == pytest.approx(stats.f.sf(2.2, 3, 40), rel=1e-10)
-    a, b = [1.0, 2.0, 2.0, 3.0, 5.0, 5.0, 7.0], [2.0, 1.0, 4.0, 4.0, 3.0, 8.0, 9.0]
+    a, b = [1.0, 2.0, 2.0, 3.0, 5.0, 5.0, 7.0, 0.0], [2.0, 1.0, 4.0, 4.0, 3.0, 8.0, 9.0, 7.0]
     assert rank_correlation(a, b) == pytest.approx(tuple(stats.spearmanr(a, b)), rel=1e-10)
+
+
+def test_few_values_in_order_are_as_improbable_as_their_orders_are_many() -> None:
+    """Student's t calls six in order impossible; of their orders two of 720 are as extreme."""
+    from scipy import stats
+
+    assert rank_correlation(range(6), [1.0, 2.5, 3.0, 8.0, 9.0, 9.5]) == pytest.approx((1, 2 / 720))
+    a, b = [1.0, 2.0, 2.0, 3.0, 5.0], [4.0, 1.0, 4.0, 2.0, 3.0]
+
+    def rho(x: object) -> float:
+        return float(stats.spearmanr(x, b)[0])
+
+    exact = stats.permutation_test((a,), rho, permutation_type="pairings", n_resamples=np.inf)
+    assert rank_correlation(a, b) == pytest.approx((rho(a), exact.pvalue))
