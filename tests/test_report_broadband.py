@@ -64,7 +64,7 @@ def test_what_was_found_is_said_and_shown(repeated: bool) -> None:
     reader = Reader()
     reader.feed(broadband_html(found))
     assert reader.open == []
-    assert headline(found) == "Traced: nonlinearity_shape (cubic) at the nonlinearity"
+    assert headline(found) == "Traced: nonlinearity_shape (cubic; nonlinearity)"
     for line in (headline(found), *evidence(found)):
         assert line in reader.text
     assert "Restoring force" in reader.headings
@@ -110,5 +110,5 @@ def test_the_command_prints_writes_and_draws(tmp_path: Path) -> None:
     found = json.loads(answer.read_text("utf-8"))
     assert [e["effect"] for e in found["effects"]] == ["nonlinearity_shape"]
     assert found["verdict"] == "traced"
-    assert "Traced: nonlinearity_shape (cubic)" in done.output
-    assert "Traced: nonlinearity_shape (cubic)" in report.read_text("utf-8")
+    assert "Traced: nonlinearity_shape (cubic; nonlinearity)" in done.output
+    assert "Traced: nonlinearity_shape (cubic; nonlinearity)" in report.read_text("utf-8")

@@ -111,7 +111,7 @@ def _most(found: BroadbandDiagnosis) -> str:
 
 def _named(found: BroadbandDiagnosis) -> list[str]:
     candidates = [w.score.candidate for w in found.claims]
-    return [f"{c.effect} ({c.kind}) at the {c.location}" for c in candidates]
+    return [f"{c.effect} ({c.kind}; {c.location})" for c in candidates]
 
 
 def _size(value: float, unit: str) -> str:
