@@ -38,6 +38,7 @@ from drivers.types import (
 
 POLL_S = 0.002  # how often a waiting `read` looks; the callback may not wake anybody
 DRY = 2.0  # output latencies without a callback after which the output has certainly played out
+HELD_BACK_S = 0.1  # a sound server may hold more than its latency says: ramps were cut without it
 STALL_S = 1.0  # a stream without a callback for so long is lost (longest buffers are ~0.2 s)
 
 
@@ -258,12 +259,15 @@ class SoundCardRig:
     def _play_out(self, stream: _Stream) -> None:
         """Wait until the ramp has left the card's buffer, which stopping would throw away.
 
-        Takes the ramp and the output's latency, and is cut short when the device is gone.
+        Takes the ramp, the output's latency and what a server holds beyond that, and is cut short
+        when the device is gone.
         """
         latency = max(float(stream.handle.latency[1]), self.settings.latency_s)
         quiet = math.inf
-        deadline = time.monotonic() + self.limits.silence_ramp_s + latency + 0.2
-        while self._fault(stream) is None and time.monotonic() < min(deadline, quiet + latency):
+        deadline = time.monotonic() + self.limits.silence_ramp_s + latency + 2 * HELD_BACK_S
+        while self._fault(stream) is None and time.monotonic() < min(
+            deadline, quiet + latency + HELD_BACK_S
+        ):
             if self.guard.output_v == 0.0:
                 quiet = min(quiet, time.monotonic())
             time.sleep(POLL_S)
