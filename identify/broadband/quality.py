@@ -20,6 +20,7 @@ from identify.quality.samples import (
     MANY_HELD,
     STEP_SAMPLES,
     STEP_SIGMAS,
+    held_runs,
     high_frequency_noise,
     repeats,
 )
@@ -29,7 +30,6 @@ from identify.results import QualityFlag
 
 FloatArray = npt.NDArray[np.float64]
 
-HELD = 3  # equal samples in a row while the motion goes on
 TONE_P = 1e-6  # chance of a tone among noise, all bins considered
 PURE = 8.0  # power of a tone's main lobe over that of the bins beside it
 MOST = 5  # tones that are named
@@ -96,15 +96,9 @@ def _repeated(
 
 
 def _held(record: Excitation, declared: Fit, name: str) -> list[QualityFlag]:
-    x, model = record.y, declared.prediction
-    same = np.r_[False, np.diff(x) == 0, False]
-    edges = np.flatnonzero(np.diff(same.astype(np.int8)))
-    start, stop = edges[0::2], edges[1::2]
-    long = stop - start >= HELD - 1
-    start, stop = start[long], stop[long]
+    x = record.y
     reach = 8 * high_frequency_noise(declared.residual) + 4 * _step(x)
-    moved = np.array([np.ptp(model[a : b + 1]) for a, b in zip(start, stop, strict=True)])
-    stuck = moved > reach if moved.size else np.zeros(0, dtype=bool)
+    start, stop, stuck = held_runs(x, declared.prediction, reach)
     count = int(np.sum((stop - start)[stuck]))
     if count == 0:
         return []

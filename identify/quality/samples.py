@@ -143,17 +143,9 @@ def held(view: View) -> list[QualityFlag]:
         row = view.inputs.index(name) if name in view.inputs else view.rest.shape[0] - 1
         x, rest = view.values[name], view.rest[row]
         step = view.run.signals[name].resolution or 0.0
-        same = np.r_[False, np.diff(x) == 0, False]
-        edges = np.flatnonzero(np.diff(same.astype(np.int8)))
-        start, stop = edges[0::2], edges[1::2]  # samples start … stop are equal
-        long = stop - start >= HELD - 1
-        start, stop = start[long], stop[long]
+        start, stop, stuck = held_runs(x, x - rest, 8 * high_frequency_noise(rest) + 4 * step)
         if start.size == 0:
             continue
-        model = x - rest
-        reach = 8 * high_frequency_noise(rest) + 4 * step
-        moved = np.array([np.ptp(model[a : b + 1]) for a, b in zip(start, stop, strict=True)])
-        stuck = moved > reach
         extreme = (np.abs(x[start] - x.max()) <= step) | (np.abs(x[start] - x.min()) <= step)
         stuck &= ~extreme  # flat tops are clipping
         count = int(np.sum((stop - start)[stuck]))
@@ -167,6 +159,20 @@ def held(view: View) -> list[QualityFlag]:
         )
         out.append(finding(view.name, "repeated_samples", severity, detail))
     return out
+
+
+def held_runs(
+    x: FloatArray, model: FloatArray, reach: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Runs of HELD equal samples or more, start … stop, and during which of them the `model` moves
+    by more than `reach`."""
+    same = np.r_[False, np.diff(x) == 0, False]
+    edges = np.flatnonzero(np.diff(same.astype(np.int8)))
+    start, stop = edges[0::2], edges[1::2]  # samples start … stop are equal
+    long = stop - start >= HELD - 1
+    start, stop = start[long], stop[long]
+    moved = [np.ptp(model[a : b + 1]) for a, b in zip(start, stop, strict=True)]
+    return start, stop, np.array(moved, dtype=float) > reach
 
 
 def high_frequency_noise(rest: FloatArray) -> float:

@@ -153,10 +153,12 @@ def _quality(found: BroadbandDiagnosis) -> str:
     return table(["flag", "consequence", "detail"], rows) if rows else ""
 
 
-def _weighed(found: BroadbandDiagnosis) -> str:
-    if not found.weighed:
-        return ""
-    rows = [
+WEIGHED_HEAD = ("effect", "location", "kind", "without it", "claimed", "does as well")
+
+
+def weighed_rows(found: BroadbandDiagnosis) -> list[list[str]]:
+    """Each term that was added, and what it is worth, under `WEIGHED_HEAD`."""
+    return [
         [
             w.score.candidate.effect,
             w.score.candidate.location,
@@ -167,13 +169,17 @@ def _weighed(found: BroadbandDiagnosis) -> str:
         ]
         for w in found.weighed
     ]
+
+
+def _weighed(found: BroadbandDiagnosis) -> str:
+    if not found.weighed:
+        return ""
     note = (
         "What exceeds the noise without the term, as a multiple of what does with it: a term is "
         "claimed where that is more than three and no candidate of another name does as well. "
         "Where the noise is unknown, all that is left counts."
     )
-    head = ["effect", "location", "kind", "without it", "claimed", "does as well"]
-    return table(head, rows, note, numeric=(3,))
+    return table(WEIGHED_HEAD, weighed_rows(found), note, numeric=(3,))
 
 
 def _parameters(found: BroadbandDiagnosis) -> str:

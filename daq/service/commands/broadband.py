@@ -1,6 +1,5 @@
 """`entrain diagnose` of a campaign with broadband excitation."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -48,7 +47,7 @@ def report(path: Path, found: "BroadbandDiagnosis") -> None:
 
 def show(found: "BroadbandDiagnosis") -> None:
     """Print the errors term by term, what each term is worth, and the verdict with its evidence."""
-    from identify.report.broadband import evidence, headline
+    from identify.report.broadband import WEIGHED_HEAD, evidence, headline, weighed_rows
 
     kept = [name for name in ("odd_excited", "even") if name in found.stages[0].lines_rms]
     table(
@@ -66,19 +65,7 @@ def show(found: "BroadbandDiagnosis") -> None:
         ],
     )
     table(
-        "what was added, and what exceeds the noise without it",
-        ("effect", "location", "kind", "without it", "claimed", "does as well"),
-        [
-            (
-                w.score.candidate.effect,
-                w.score.candidate.location,
-                w.score.candidate.kind,
-                f"{number(w.without, 3)} times" if math.isfinite(w.without) else "all of it",
-                "yes" if w in found.claims else "no",
-                ", ".join(w.rivals),
-            )
-            for w in found.weighed
-        ],
+        "what was added, and what exceeds the noise without it", WEIGHED_HEAD, weighed_rows(found)
     )
     for flag in found.quality:
         out.print(f"{flag.flag} ({flag.severity}): {flag.detail}", markup=False)
