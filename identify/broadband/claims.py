@@ -43,18 +43,21 @@ class Outcome:
     weighed: tuple[Weighed, ...]
     noise: Noise | None
     remainder: Remainder
+    spoilt: bool = False
 
     @property
     def claims(self) -> tuple[Weighed, ...]:
-        """The terms to be claimed: beside more than noise, only those without rival."""
+        """The terms to be claimed: beside more than noise, only those without rival; of a spoilt
+        recording none."""
+        if self.spoilt:
+            return ()
         sure = (w for w in self.weighed if w.accounts)
         return tuple(w for w in sure if not (w.rivals and self.remainder.significant))
 
     def nothing_claimed(self, record: Excitation, declared: Fit, estimation: slice) -> "Outcome":
         """The same with every term dropped, whatever it accounts for."""
-        weighed = tuple(replace(w, without=0.0, rivals=()) for w in self.weighed)
         rest = remainder(record, declared, estimation, self.noise)
-        return Outcome(declared, weighed, self.noise, rest)
+        return replace(self, fit=declared, remainder=rest, spoilt=True)
 
 
 @dataclass(frozen=True)

@@ -246,7 +246,7 @@ def diagnose_broadband(
         weighed=outcome.weighed,
         claims=outcome.claims,
         quality=flags,
-        verdict=_verdict(outcome, flags),
+        verdict=_verdict(outcome),
         remainder=outcome.remainder,
         remainders=tuple(remainder(record, s.fit, estimation, outcome.noise) for s in stages),
         seconds=time.perf_counter() - began,
@@ -370,11 +370,11 @@ def _with_scores(stage: Stage, scores: tuple[Score, ...]) -> Stage:
     return Stage(**{**stage.__dict__, "scores": scores})
 
 
-def _verdict(outcome: Outcome, flags: tuple[QualityFlag, ...]) -> Verdict:
+def _verdict(outcome: Outcome) -> Verdict:
     """Traced: terms account for the residual and what remains is noise. Ambiguous: others would do
     as well. Unexplained: more than noise remains, whatever accounts for a part of it; or the
     recording is spoilt, and says nothing."""
-    if outcome.remainder.significant or spoilt(flags):
+    if outcome.remainder.significant or outcome.spoilt:
         return "unexplained"
     if any(w.rivals for w in outcome.claims):
         return "ambiguous"
