@@ -200,6 +200,31 @@ def test_other_forms_of_what_leaves_a_gross_misfit(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_an_effect_that_others_kept_from_its_refit(tmp_path: Path) -> None:
+    """Thirteen forms come nearer at coarse noise than a gross loss of end and mouth, and are the
+    ones refitted: none comes within a hundred times the noise. By itself it does."""
+    loss = make_effect("nonlinear_damping/cubic", {"cubic_s_per_m2": 3.938})
+    rig = random_rig(30678, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    ready = record(tmp_path, 30678, rig, [loss], forced=7, validation=2)
+    base = start.fit_from_data(ready.structure, ready.data)
+    nearer = (
+        "acoustic_mode:mode",
+        "channel_mismatch:gain_phase",
+        "channel_mismatch:highpass",
+        "drive_pickup:velocity",
+        "flame_dynamics:second_time_scale",
+        "sensor_offset:mode_shapes",
+        "sensor_offset:modal_2",
+        "sensor_offset:propagation",
+    )
+    forms = [*map(by_key, nearer), *(e for e in CATALOGUE if e.name == "nonlinear_damping")]
+    found = trace.search(ready.structure, ready.data, base, catalogue=forms, depth=1)
+    assert min(t.fit.chi2_per_dof for t in found.singles) > 100.0
+    (best,) = (t for t in found.tried if t.explains)
+    assert best.key_of_forms == ("nonlinear_damping:cubic_end",)
+
+
+@pytest.mark.slow
 def test_two_time_scales_of_the_flame_behind_a_lag(tmp_path: Path) -> None:
     """Neither a lag nor a second time scale explains both; from where another form has come, whose
     response is matched first, the two poles and the zero are found."""

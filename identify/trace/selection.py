@@ -135,6 +135,8 @@ def search(
         level = best_by_name(found)
         if size == 2 and not going.explained:
             level = [*going.of_more_modes(level), *level]
+    if not going.explained:
+        going.each_alone(scores)
     going.contest()
     everything = against_chance(going.tried)
     ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
@@ -195,31 +197,33 @@ class _Searching:
 
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
-        data, base, run = self.data, self.base, self.run
-        far = astray(base)
-        singles = try_effects(
-            self.structure, data, base, self.apart, executor=run, keep=8, far=far,
-            progress=lambda share, text: self.report(0.6 * share, text), scores=scores,
-        )  # fmt: skip
-        if far and not any(t.adequate for t in singles):
-            self.report(0.6, "starting the best once more from afar")
-            singles = started_again(singles, data, run)
-        richer = [e for e in self.available if e.refines and e.restated(self.structure) is not None]
-        if richer and not any(t.explains for t in singles):
-            found = try_effects(
-                self.structure, data, base, richer, executor=run, keep=1, far=False,
-                progress=lambda share, text: self.report(0.6, text),
-            )  # fmt: skip
-            # of so many parameters that, beside another effect, they would stand for it
-            singles += [t for t in found if t.explains]
-        singles += in_other_forms(singles, data, self.available, run)
-        singles += at_the_same_place(singles, data, self.available, run)
-        singles += led_on(singles, data, run)
+        base = self.base
+        singles = _alone(
+            _Alone(self.structure, self.data, base, self.available, scores), self.run, self.report
+        )
         self.tried += singles
         if base.chi2_per_dof < LITTLE or not self.explained:
             self.report(0.6, "trying run-to-run scatter")
             self.tried += self._scattered(self.structure, base)
         return singles
+
+    def each_alone(self, scores: Mapping[str, ScoreTest] | None) -> None:
+        """Each effect as if it were the only candidate, where nothing explains the data: of all
+        together, only those are led to the end that come nearest at coarse noise."""
+        names = list(dict.fromkeys(e.name for e in self.available))
+        items = [
+            _Alone(
+                self.structure,
+                self.data,
+                self.base,
+                tuple(e for e in self.available if e.name == name),
+                scores,
+            )
+            for name in names
+        ]
+        for i, found in enumerate(self.run.map(_by_itself, items), start=1):
+            self.tried += found
+            self.report(0.9 + 0.05 * i / len(names), f"trying {names[i - 1]} by itself")
 
     def pairs(self, singles: Sequence[Tried]) -> list[Tried]:
         """Two effects sought at once, unless some together explain the data already."""
@@ -401,6 +405,46 @@ class _Searching:
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
         self.tried += settled(self.tried, data, run)
+
+
+@dataclass(frozen=True)
+class _Alone:
+    """What a worker needs to try effects one by one."""
+
+    structure: Structure
+    data: Dataset
+    base: Fit
+    available: tuple[Effect, ...]
+    scores: Mapping[str, ScoreTest] | None
+
+
+def _alone(work: _Alone, run: Executor, report: Progress) -> list[Tried]:
+    """Every effect by itself; the best of them in their other forms too."""
+    data, base, available = work.data, work.base, work.available
+    far = astray(base)
+    singles = try_effects(
+        work.structure, data, base, [e for e in available if not e.refines], executor=run, keep=8,
+        far=far, progress=lambda share, text: report(0.6 * share, text), scores=work.scores,
+    )  # fmt: skip
+    if far and not any(t.adequate for t in singles):
+        report(0.6, "starting the best once more from afar")
+        singles = started_again(singles, data, run)
+    richer = [e for e in available if e.refines and e.restated(work.structure) is not None]
+    if richer and not any(t.explains for t in singles):
+        found = try_effects(
+            work.structure, data, base, richer, executor=run, keep=1, far=False,
+            progress=lambda share, text: report(0.6, text),
+        )  # fmt: skip
+        # of so many parameters that, beside another effect, they would stand for it
+        singles += [t for t in found if t.explains]
+    singles += in_other_forms(singles, data, available, run)
+    singles += at_the_same_place(singles, data, available, run)
+    singles += led_on(singles, data, run)
+    return singles
+
+
+def _by_itself(work: _Alone) -> list[Tried]:
+    return _alone(work, InProcess(), lambda share, text: None)
 
 
 def _a_place_to_grow_from(singles: Sequence[Tried], base: Fit) -> bool:
