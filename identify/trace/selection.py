@@ -210,7 +210,9 @@ class _Searching:
     def each_alone(self, scores: Mapping[str, ScoreTest] | None) -> None:
         """Each effect as if it were the only candidate, where nothing explains the data: of all
         together, only those are led to the end that come nearest at coarse noise."""
+        modes = {e.name for e in self.available if e.restated(self.structure) is not None}
         names = list(dict.fromkeys(e.name for e in self.available))
+        names.sort(key=lambda name: name not in modes)  # which take longest: not to be waited for
         items = [
             _Alone(
                 self.structure,
