@@ -167,7 +167,7 @@ def one(task: tuple[str, int, str | None, bool]) -> dict[str, Any]:
          "parameters": {k: v["value"] for k, v in e.parameters().items()}}
         for e in effects
     ]  # fmt: skip
-    record |= {"modes": modes, "runs": len(campaign.runs)}
+    record["modes"], record["runs"] = modes, len(campaign.runs)
     began = time.process_time()
     try:
         with warnings.catch_warnings():
@@ -188,7 +188,7 @@ def one(task: tuple[str, int, str | None, bool]) -> dict[str, Any]:
              "parameters": {n: [v.value, v.stderr] for n, v in e.parameters.items()}}
             for e in d.effects
         ],
-        "declared": {n: [v.value, v.stderr] for n, v in d.after.fit.estimates.items()},
+        "fitted": {n: [v.value, v.stderr] for n, v in d.after.fit.estimates.items()},
         "last_s": max(c.started_s for c in d.before.comparisons),
         "best": [list(c.effects) for c in d.candidates[:4]],
         "where": [] if d.whereabouts is None else list(d.whereabouts.likely),
@@ -239,10 +239,10 @@ def deviations(r: dict[str, Any]) -> list[tuple[str, float]]:
         return []
     last_s = r.get("last_s", 120.0 * (r["runs"] - 1))
     found = {name: claim["parameters"][f"{claim['effect']}.{name}"] for name in rules}
-    if claim["form"] == "mode" and "declared" in r:
+    if claim["form"] == "mode" and "fitted" in r:
         # which of the modes is the further one is a matter of naming: that which is nearest
         others = [
-            {name: r["declared"][f"mode{i}.{name}"] for name in rules}
+            {name: r["fitted"][f"mode{i}.{name}"] for name in rules}
             for i in range(2, r["modes"] + 1)
         ]
         true_hz = truth["parameters"]["frequency_hz"]
