@@ -154,7 +154,7 @@ def test_many_tests_count_as_many_as_they_are() -> None:
     errors of 20 000 draws)."""
     axes = np.linalg.qr(np.random.default_rng(1).standard_normal((60, 20)))[0]
     least = 0.004
-    unrelated = [trace.ScoreTest(8.3, axes[0], 1.0, least, axis[:, None]) for axis in axes.T]
+    unrelated = [trace.ScoreTest(8.3, 1.0, least, axis[:, None]) for axis in axes.T]
     assert trace.family_p(unrelated) == pytest.approx(1 - (1 - least) ** 20, abs=0.008)
     assert trace.family_p(unrelated[:1] * 20) == pytest.approx(least, abs=0.002)
     sure = replace(unrelated[0], p_value=1e-9)

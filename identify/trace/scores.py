@@ -3,6 +3,8 @@
 A tangent is projected off those of the fitted parameters, so that what the fit can absorb is not
 counted as evidence. An effect whose shape is unknown where its size is zero (the frequency of a
 mode that takes no part) is tested at one shape after the other: to start from, never as evidence.
+A start is a step of all unknowns together: the fit mostly absorbs nearly all of an effect, and the
+effect beside what had stood for it leaves far more than there was.
 """
 
 from collections.abc import Sequence
@@ -21,20 +23,20 @@ FloatArray = npt.NDArray[np.float64]
 
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
+STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])  # shares of a Gauss–Newton step that are tried
 
 
 @dataclass(frozen=True)
 class ScoreTest:
     """An effect's tangent at its neutral point, projected off the fitted parameters' tangents.
 
-    `drop` is the decrease of χ² that a small effect along it would bring, `size` its estimated
-    internal values, `share` the part of the tangent that the fit cannot absorb, `p_value` of the
-    drop for as many degrees of freedom as the tangent keeps, `basis` (n, degrees of freedom) an
-    orthonormal one of what it keeps: drop = |basisᵀ ρ|².
+    `drop` is the decrease of χ² that a small effect along it would bring, `share` the part of the
+    tangent that the fit cannot absorb, `p_value` of the drop for as many degrees of freedom as the
+    tangent keeps, `basis` (n, degrees of freedom) an orthonormal one of what it keeps:
+    drop = |basisᵀ ρ|².
     """
 
     drop: float
-    size: FloatArray
     share: float
     p_value: float
     basis: FloatArray
@@ -60,20 +62,18 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     share = float(np.linalg.norm(rest)) / norm
     if share < 1e-5:  # wholly absorbed: what is left of the tangent is rounding
         return None
-    U, S, V = np.linalg.svd(rest, full_matrices=False)
-    kept = 1e-8 * S[0] < S
-    basis = U[:, kept]
+    U, S, _ = np.linalg.svd(rest, full_matrices=False)
+    basis = U[:, 1e-8 * S[0] < S]
     along = basis.T @ rho
-    step = -V[kept].T @ (along / S[kept])
     drop = float(along @ along)
-    return ScoreTest(drop, step, share, chi2_tail(drop, basis.shape[1]), basis)
+    return ScoreTest(drop, share, chi2_tail(drop, basis.shape[1]), basis)
 
 
 def scan(
     structure: Structure, data: Dataset, fit: Fit, effect: Effect, shapes: Sequence[Sequence[float]]
 ) -> list[tuple[float, FloatArray]]:
-    """What a small effect of each shape (`Effect.shapes`) would take off χ², and its unknowns; the
-    best first, of neighbours within 8 % only the better."""
+    """What a small effect of each shape (`Effect.shapes`) would take off χ², and the shape's
+    internal values; the best first, of neighbours within 8 % only the better."""
     larger = structure.with_effects(effect)
     rows = np.stack([effect.to_internal(shape) for shape in shapes])
     sized = np.array([value == 0 for value in shapes[0]])
@@ -89,12 +89,42 @@ def scan(
         tangent = J[:, count:][:, sized]
         rest = tangent - Q @ (Q.T @ tangent)
         size = np.linalg.lstsq(rest, -rho, rcond=None)[0]
-        row[sized] = size
         found.append((float(rho @ rho - np.sum((rho + rest @ size) ** 2)), row))
     out: list[tuple[float, FloatArray]] = []
     for drop, row in sorted(found, key=lambda item: -item[0]):
         if all(np.abs(row[~sized] - other[~sized]).max() > 0.08 for _, other in out):
             out.append((drop, row))
+    return out
+
+
+def stepped(
+    structure: Structure,
+    data: Dataset,
+    fit: Fit,
+    effect: Effect,
+    rows: Sequence[FloatArray],
+) -> list[FloatArray]:
+    """Unknowns to start from with a small effect, of each of `rows`, its internal values where it
+    has no size: a Gauss–Newton step of all unknowns, as much of it as leaves least of χ²."""
+    larger = structure.with_effects(effect)
+    thetas = np.stack([np.r_[fit.theta, row] for row in rows])
+    residual = OrbitResidual(larger, data.fit)
+    outcome = residual(thetas, np.arange(len(thetas)), True)
+    if outcome.jacobian is None:
+        return []
+    out = []
+    for theta, exists, rho, J in zip(
+        thetas, outcome.exists, outcome.residual, outcome.jacobian, strict=True
+    ):
+        if not exists:
+            continue
+        norms = np.sqrt(np.sum(J**2, axis=0)) + 1e-300
+        step = np.linalg.lstsq(J / norms, -rho, rcond=1e-10)[0] / norms
+        tries = theta + STEPS[:, None] * step
+        reached = residual(tries, np.arange(len(tries)), False)
+        left = np.where(reached.exists, np.sum(reached.residual**2, axis=1), np.inf)
+        if np.isfinite(left).any():
+            out.append(tries[np.argmin(left)])
     return out
 
 

@@ -31,7 +31,7 @@ from identify.trace.contests import (
 )
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
-from identify.trace.scores import ScoreTest, score_tests
+from identify.trace.scores import ScoreTest, score_tests, stepped
 from identify.trace.stages import (
     as_declared,
     started_again,
@@ -604,10 +604,13 @@ def _beside_chance(
         )
         best = first_of_each(ranked, lambda e: e.name)  # the best form of each
         for e in list(best.values())[:BESIDE]:
-            theta = np.r_[base.theta, scores[e.key].size]
-            larger = base.structure.with_effects(e)
-            fit = fit_orbits(larger, wide, theta, continuation=(0.0,))
-            out += try_scatters(larger, data, fit, [chance], run)
+            neutral = e.neutral()
+            assert neutral is not None  # or it would have no score
+            thetas = stepped(base.structure, wide, base, e, [e.to_internal(neutral)])
+            if thetas:
+                larger = base.structure.with_effects(e)
+                fit = fit_orbits(larger, wide, thetas[0], continuation=(0.0,))
+                out += try_scatters(larger, data, fit, [chance], run)
     return out
 
 

@@ -33,7 +33,7 @@ from identify.start import (
     signed_starts,
 )
 from identify.structure import Effect, Known, Structure
-from identify.trace.scores import ScoreTest, scan, score_tests
+from identify.trace.scores import ScoreTest, scan, score_tests, stepped
 from identify.trace.tried import Tried, best_by_name, few_of_each, first_of_each, misfit, tried
 
 FloatArray = npt.NDArray[np.float64]
@@ -87,6 +87,8 @@ class _Task:
     shares: tuple[float, float, float]  # of each coefficient's size that count as noise, by stage
     score: ScoreTest | None
     hopeless: float = np.inf  # times what noise leaves, where nothing else matters
+    promise: float = 0.0  # what a small effect would take off χ² by the base fit's tangents …
+    small: tuple[FloatArray, ...] = ()  # … and unknowns with it, to start from
     placements: tuple[tuple[float, ...], ...] = ()
 
     @property
@@ -141,12 +143,7 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
         np.r_[beside(task.structure, task.base.theta, task.data, task.effect, values), row]
         for values, row in zip(task.proposals, inner, strict=True)
     ]
-    neutral = task.effect.neutral()
-    if neutral is not None:  # never worse than without the effect
-        thetas.append(np.r_[task.base.theta, task.effect.to_internal(neutral)])
-    if task.score is not None:
-        bound = 20 * np.max(np.abs(inner), axis=0) + 1e-12
-        thetas.append(np.r_[task.base.theta, np.clip(task.score.size, -bound, bound)])
+    thetas += task.small
     first = task.shares[0]
     starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
     if task.richer is not None:
@@ -193,34 +190,36 @@ def _second_stage(item: tuple[_Task, list[CoarseStart]]) -> Fit:
     return canonical(fit, task.data)
 
 
-def _promise(task: _Task) -> tuple[float, list[FloatArray]]:
-    """What a small effect would take off χ² by the base fit's tangents, and unknowns of the effect
-    to start from."""
+def _promise(task: _Task) -> _Task:
+    """With what a small effect would take off χ² by the base fit's tangents, and unknowns with it:
+    never worse than without, where it has a neutral point."""
     neutral, shapes = task.effect.neutral(), task.effect.shapes(task.known)
-    if task.score is not None and neutral is not None:
-        return task.score.drop, [task.effect.to_internal(neutral), task.score.size]
-    if shapes:
+    promise, rows = 0.0, []
+    small: list[FloatArray] = []
+    if neutral is not None:
+        rows = [task.effect.to_internal(neutral)]
+        small = [np.r_[task.base.theta, rows[0]]]
+        promise = 0.0 if task.score is None else task.score.drop
+    elif shapes and task.base.converged:
         found = scan(task.structure, task.data, task.base, task.effect, shapes)[:SHAPES]
-        return max((drop for drop, _ in found), default=0.0), [row for _, row in found]
-    return 0.0, []
+        rows = [row for _, row in found]
+        promise = max((drop for drop, _ in found), default=0.0)
+    if promise > 0:
+        small += stepped(task.structure, task.data, task.base, task.effect, rows)
+    return replace(task, promise=promise, small=tuple(small))
 
 
-def _promising(
-    tasks: Sequence[_Task], executor: Executor, keep: int
-) -> list[tuple[_Task, list[FloatArray]]]:
+def _promising(tasks: Sequence[_Task], keep: int) -> list[_Task]:
     """The effects that promise most of the misfit, no more than two forms of one."""
-    sure = [t for t in tasks if t.base.converged]
-    promised = zip(sure, executor.map(_promise, sure), strict=True)
-    ranked = sorted(promised, key=lambda item: -item[1][0])
-    most = [(t, rows) for t, (drop, rows) in ranked if drop > PROMISED * t.base.chi2]
-    return few_of_each(most, lambda item: item[0].effect.name, 2)[:keep]
+    ranked = sorted((t for t in tasks if t.base.converged and t.small), key=lambda t: -t.promise)
+    most = [t for t in ranked if t.promise > PROMISED * t.base.chi2]
+    return few_of_each(most, lambda t: t.effect.name, 2)[:keep]
 
 
-def _straight(item: tuple[_Task, list[FloatArray]]) -> Fit:
+def _straight(task: _Task) -> Fit:
     """From the base fit at the data's own noise."""
-    task, rows = item
     larger = task.structure.with_effects(task.effect)
-    thetas = np.stack([np.r_[task.base.theta, row] for row in rows])
+    thetas = np.stack(task.small)
     fit = fit_orbits(larger, task.data, thetas, continuation=(0.0,), hopeless=task.hopeless)
     return canonical(fit, task.data)
 
@@ -326,11 +325,12 @@ def try_effects(
         _Task(structure, data, rough, base, e, known, shares, scores.get(e.key), hopeless)
         for e in effects
     ]
+    tasks = list(executor.map(_promise, tasks))
     staged: list[tuple[_Task, list[CoarseStart]]] = []
     for task, starts in zip(tasks, executor.map(_first_stage, tasks), strict=True):
         staged.append((task, starts))
         progress(len(staged) / len(tasks) * 0.3, f"trying {task.effect.key}")
-    out = _finite(executor.map(_straight, _promising(tasks, executor, keep)), data)
+    out = _finite(executor.map(_straight, _promising(tasks, keep)), data)
     exact = executor.map(_balanced, [t for t in tasks if t.richer is not None])
     balanced = _finite((fit for fit in exact if fit is not None), data)
     out += [t for t in balanced if t.adequate]  # the others are local minima
