@@ -24,6 +24,8 @@ from identify.trace.contests import (
     matched,
     reformed,
 )
+from identify.trace.scores import scan, stepped
+from identify.trace.stages import known_sizes
 from identify.trace.tried import tried
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
@@ -197,6 +199,28 @@ def test_other_forms_of_what_leaves_a_gross_misfit(tmp_path: Path) -> None:
     assert set(right.key_of_forms) == wanted
     assert right.estimates["actuator_nonlinearity.level_v"].value == pytest.approx(1.0, abs=1e-3)
     assert right.estimates["actuator_nonlinearity.order"].value == pytest.approx(8.0, abs=0.05)
+
+
+def test_what_the_fit_mostly_absorbs_starts_with_what_stands_for_it(tmp_path: Path) -> None:
+    """A slow share of the flame's response that the declared fit, at χ²/dof 6, has nearly absorbed:
+    put beside the declared values it leaves a thousand times as much, and was lost from there."""
+    slow = make_effect(
+        "flame_dynamics/second_time_scale",
+        {"slow_share": 0.07758239957477514, "slow_pole_hz": 45.53000808951163},
+    )
+    rig = random_rig(30866, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    ready = record(tmp_path, 30866, rig, [slow], forced=8, validation=2, modes=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert 3.0 < base.chi2_per_dof < 10.0
+    form = by_key("flame_dynamics:second_time_scale")
+    larger = ready.structure.with_effects(form)
+    shapes = form.shapes(known_sizes(ready.data, base))
+    rows = [row for _, row in scan(ready.structure, ready.data, base, form, shapes)[:4]]
+    thetas = stepped(ready.structure, ready.data, base, form, rows)
+    fit = fit_orbits(larger, ready.data, np.stack(thetas), continuation=(0.0,))
+    assert tried((form,), fit, ready.data).explains
+    beside = np.r_[base.theta, form.to_internal((0.0776, 1 / (2 * np.pi * 45.53)))]
+    assert fit_orbits(larger, ready.data, beside, iterations=0).chi2 > 100 * base.chi2
 
 
 @pytest.mark.slow
