@@ -68,9 +68,10 @@ class ChannelMismatch(Effect):
             "lowpass": (lag,),
             "highpass": (corner,),
             "gain_lowpass": (gain, lag),
+            "gain_highpass": (gain, corner),
             "skew_lowpass": (skew, lag),
         }[form]
-        self.refines = form in ("gain_lowpass", "skew_lowpass")
+        self.refines = form in ("gain_lowpass", "gain_highpass", "skew_lowpass")
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [tuple(p.scale for p in self.parameters)]
@@ -252,6 +253,7 @@ EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("lowpass"),
     ChannelMismatch("highpass"),
     ChannelMismatch("gain_lowpass"),
+    ChannelMismatch("gain_highpass"),
     ChannelMismatch("skew_lowpass"),
     SensorOffset("propagation"),
     SensorOffset("mode_shapes"),

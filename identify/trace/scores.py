@@ -23,7 +23,8 @@ FloatArray = npt.NDArray[np.float64]
 
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
-STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])  # shares of a Gauss–Newton step that are tried
+STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])  # shares of a Gauss–Newton step that are tried …
+NEAR = 10.0  # … and times the χ² there was that the best of them may leave
 
 
 @dataclass(frozen=True)
@@ -118,12 +119,14 @@ def stepped(
     ):
         if not exists:
             continue
-        norms = np.sqrt(np.sum(J**2, axis=0)) + 1e-300
-        step = np.linalg.lstsq(J / norms, -rho, rcond=1e-10)[0] / norms
+        norms = np.sqrt(np.sum(J**2, axis=0))
+        seen = norms > 1e-10 * norms.max()  # the shape of what has no size is not
+        step = np.zeros_like(theta)
+        step[seen] = np.linalg.lstsq(J[:, seen] / norms[seen], -rho, rcond=1e-10)[0] / norms[seen]
         tries = theta + STEPS[:, None] * step
         reached = residual(tries, np.arange(len(tries)), False)
         left = np.where(reached.exists, np.sum(reached.residual**2, axis=1), np.inf)
-        if np.isfinite(left).any():
+        if left.min() < NEAR * float(rho @ rho):
             out.append(tries[np.argmin(left)])
     return out
 
