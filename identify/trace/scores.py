@@ -107,6 +107,8 @@ def stepped(
 ) -> list[FloatArray]:
     """Unknowns to start from with a small effect, of each of `rows`, its internal values where it
     has no size: a Gauss–Newton step of all unknowns, as much of it as leaves least of χ²."""
+    if not rows:
+        return []
     larger = structure.with_effects(effect)
     thetas = np.stack([np.r_[fit.theta, row] for row in rows])
     residual = OrbitResidual(larger, data.fit)

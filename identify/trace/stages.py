@@ -204,7 +204,7 @@ def _promise(task: _Task) -> _Task:
         found = scan(task.structure, task.data, task.base, task.effect, shapes)[:SHAPES]
         rows = [row for _, row in found]
         promise = max((drop for drop, _ in found), default=0.0)
-    if promise > 0:
+    if neutral is None or promise > PROMISED * task.base.chi2:
         small += stepped(task.structure, task.data, task.base, task.effect, rows)
     return replace(task, promise=promise, small=tuple(small))
 
