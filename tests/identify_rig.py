@@ -46,7 +46,7 @@ def true_values() -> dict[str, float]:
 
 
 @numba.njit
-def _step_through(frequency_hz, amplitude, skip, count, every, h):  # type: ignore[no-untyped-def]
+def _step_through(frequency_hz, amplitude, pole, skip, count, every, h):  # type: ignore[no-untyped-def]
     """Fourth-order Runge–Kutta; every `every`-th velocity after `skip` steps."""
     w2 = (2 * np.pi * FREQUENCIES) ** 2
     loss = 2 * DAMPING * 2 * np.pi * FREQUENCIES
@@ -62,7 +62,7 @@ def _step_through(frequency_hz, amplitude, skip, count, every, h):  # type: igno
             z = x + part * h * k[max(stage - 1, 0)] if stage else x
             y = D[0] * z[2] + D[1] * z[3]
             q = z[4]
-            dq = GAIN * y - POLE * q
+            dq = GAIN * y - pole * q
             flame = (22.5 - 2 * 15000 * q / 4000**2 - 3 * 200 * q**2 / 4000**3) * dq
             drive = amplitude * np.sin(omega * h * (n - skip + part))
             for i in range(2):
@@ -75,8 +75,11 @@ def _step_through(frequency_hz, amplitude, skip, count, every, h):  # type: igno
 
 
 @lru_cache(maxsize=64)
-def velocity(frequency_hz: float, amplitude: float, seconds: float, rate: float) -> FloatArray:
-    """Settled velocity under u = F sin ωt, with phase zero at the first sample.
+def velocity(
+    frequency_hz: float, amplitude: float, seconds: float, rate: float, pole: float = POLE
+) -> FloatArray:
+    """Settled velocity under u = F sin ωt, with phase zero at the first sample; `pole` (rad/s) is
+    the flame's.
 
     100 kHz steps: (ωh)⁵ of the third harmonic is 4e-8; five seconds of settling, e^{-5·5.9} of
     the free cycle's own rate, leave 1e-12.
@@ -84,4 +87,5 @@ def velocity(frequency_hz: float, amplitude: float, seconds: float, rate: float)
     every = round(100_000 / rate)
     h = 1.0 / (rate * every)
     skip = round(5.0 / h)
-    return np.asarray(_step_through(frequency_hz, amplitude, skip, round(seconds * rate), every, h))
+    count = round(seconds * rate)
+    return np.asarray(_step_through(frequency_hz, amplitude, pole, skip, count, every, h))

@@ -10,7 +10,7 @@ import pytest
 from identify import balance
 from identify.dual import Dual
 from identify.effects import by_key
-from identify.effects.shaped import ShapedMemory
+from identify.effects.shaped import Setting, ShapedMemory
 from identify.polynomial import Polynomial
 from identify.structure import Characteristic, Conditions, Effect, Loop, Structure, declared_modes
 from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
@@ -120,7 +120,7 @@ def test_slopes_of_what_is_sampled_agree_with_differences(form: str) -> None:
 
 def test_slopes_of_a_memory_of_several_plays_agree_with_differences() -> None:
     """At each moment its output follows the input of several."""
-    assert_slopes_agree_with_differences(ShapedMemory(FREE_HZ, 2), [800.0, 0.5, -0.7, 0.9])
+    assert_slopes_agree_with_differences(ShapedMemory(Setting(FREE_HZ, 2)), [800.0, 0.5, -0.7, 0.9])
 
 
 @pytest.mark.parametrize(
@@ -128,7 +128,7 @@ def test_slopes_of_a_memory_of_several_plays_agree_with_differences() -> None:
     [
         (by_key("nonlinearity_shape:dead_zone"), [800.0]),
         (by_key("nonlinearity_shape:hysteresis"), [800.0]),
-        (ShapedMemory(FREE_HZ, 2), [800.0, 0.5, -0.7, 0.9]),
+        (ShapedMemory(Setting(FREE_HZ, 2)), [800.0, 0.5, -0.7, 0.9]),
     ],
 )
 def test_what_is_behind_an_operator_changes_with_its_parameters(

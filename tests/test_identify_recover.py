@@ -8,29 +8,36 @@ import pytest
 import identify
 from daq.importers import open_campaign
 from identify.assess import lack_of_fit_p, predict, validation_p
+from identify.executor import InProcess
 from identify.fit import Fit
 from identify.harmonics import RecordError, fit_harmonics, measure, refine_frequency
 from identify.identification import prepare
 from identify.load import load_campaign
 from identify.record import Campaign, Medium, Run, Signal
 from identify.start import fit_declared, fit_from_data
+from identify.trace.places import shaped, whereabouts
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.random_rigs import random_campaign, random_rig
-from tests.identify_rig import true_values, velocity
+from tests.identify_rig import POLE, true_values, velocity
 from tests.trace_material import record
 
 RATE = 5000.0
 CONDITIONS = ((164.0, 2.0e10), (166.0, 1.0e10), (168.0, 0.6e10), (171.0, 0.8e10), (174.0, 1.4e10),
               (177.0, 2.0e10))  # fmt: skip
+MORE = (*CONDITIONS, (165.0, 1.2e10), (167.0, 2.0e10), (172.0, 2.0e10), (175.0, 1.2e10))
 
 
-def campaign(noise: float, seed: int = 1) -> Campaign:
-    """Forced runs of one second as a velocity channel, white noise of that share of 2.4e6."""
+def campaign(noise: float, seed: int = 1, slower: float = 0.0) -> Campaign:
+    """Forced runs of one second as a velocity channel, white noise of that share of 2.4e6; with
+    `slower`, the share that the flame's corner loses in a run of that size, more runs."""
     rng = np.random.default_rng(seed)
     runs = []
-    for i, (f, a) in enumerate(CONDITIONS):
+    for i, (f, a) in enumerate(MORE if slower else CONDITIONS):
         y = velocity(f, a, 1.0, RATE)
+        if slower:
+            loud = 2 * float(np.mean(y**2)) / 2.4e6**2
+            y = velocity(f, a, 1.0, RATE, POLE * (1 - slower * loud))
         t = np.arange(y.size) / RATE
         signals = {
             "v": Signal(y + noise * 2.4e6 * rng.standard_normal(y.size), "velocity", "m/s"),
@@ -91,6 +98,16 @@ def test_clean_data_show_no_discrepancy() -> None:
     diagnosis = identify.diagnose(campaign(noise=3e-4, seed=5))
     assert diagnosis.verdict == "no_discrepancy"
     assert diagnosis.effects == ()
+
+
+def test_a_flame_that_is_slower_when_it_is_louder_is_placed() -> None:
+    """Its describing function is no filter and no characteristic, and lies in the flame alone."""
+    ready = prepare(campaign(noise=3e-4, slower=0.002))
+    base = fit_from_data(ready.structure, ready.data)
+    pieces = shaped(ready.structure, ready.data, base, [], InProcess(), lambda share, text: None)
+    found = whereabouts(pieces, [], base)
+    assert found.likely == ("flame",), found.words
+    assert found.left["flame"] < 0.1 * base.chi2_per_dof
 
 
 @pytest.mark.parametrize(("forced", "says_little"), [(1, True), (4, False)])

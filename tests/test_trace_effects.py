@@ -14,6 +14,7 @@ from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.effects.shaped import (
     LAGS,
+    Setting,
     Shaped,
     ShapedActuator,
     ShapedExperiment,
@@ -582,7 +583,7 @@ def test_what_no_candidate_explains_is_placed(
 @pytest.mark.parametrize("time", LAGS)
 def test_a_free_shape_starts_as_a_lag(time: float) -> None:
     """As near as the series, cut off there, leaves it: no |B^j − 1| is above 2."""
-    piece = ShapedFlame(100.0, 2)
+    piece = ShapedFlame(Setting(100.0, 2))
     h = dict(zip((q.name for q in piece.parameters), lag(time), strict=True))
     s = 2j * np.pi * np.array([90.0, 100.0, 110.0])
     exact = 1.0 / (1.0 + s * time / piece.corner)
@@ -596,7 +597,7 @@ def test_a_free_shape_starts_as_a_lag(time: float) -> None:
 def test_a_free_shape_restated_says_the_same(tmp_path: Path, piece: type[Shaped]) -> None:
     """Started from the richer structure's values, a piece predicts what that structure does."""
     ready = thesis_campaign(tmp_path, 7, {})
-    data, shape = ready.data, piece(ready.data.free_hz, ready.structure.mode_count)
+    data, shape = ready.data, piece(Setting(ready.data.free_hz, ready.structure.mode_count))
     richer = shape.restated(ready.structure)
     assert richer is not None
     theta = next(start.candidates(richer, data))

@@ -9,7 +9,7 @@ run to run by chance (`CHANCES`).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -54,21 +54,33 @@ def lag(time: float) -> tuple[float, ...]:
     return tuple(2 * time / (1.0 + time) ** 2 * ratio**j for j in range(STEPS))
 
 
+@dataclass(frozen=True)
+class Setting:
+    """What the pieces of a campaign are made for: the free frequency, how many modes are declared,
+    the velocity (m/s) that the fundamental usually has in forced runs, and whether a pressure is
+    known beside it."""
+
+    free_hz: float
+    modes: int
+    velocity: float = 1.0
+    pressure: bool = True
+
+
 class Shaped(Effect):
     """Root of the pieces: a linear response, and what a place needs besides."""
 
     linear = True
     besides: tuple[Parameter, ...] = ()
 
-    def __init__(self, free_hz: float, modes: int) -> None:
-        self.corner = 2 * np.pi * free_hz
+    def __init__(self, setting: Setting) -> None:
+        self.setting, self.corner = setting, 2 * np.pi * setting.free_hz
         self.name = f"shaped_{self.location}"
         steps = range(1, STEPS + 1) if self.linear else ()
         own = tuple(Parameter(f"{self.name}.h{j}", "1", scale=1e-2) for j in steps)
-        self.parameters = (*own, *self.besides, *self.of_modes(modes))
+        self.parameters = (*own, *self.besides, *self.of_the_setting())
 
-    def of_modes(self, modes: int) -> tuple[Parameter, ...]:
-        """What it needs of each of so many declared modes."""
+    def of_the_setting(self) -> tuple[Parameter, ...]:
+        """What it needs besides in this setting."""
         return ()
 
     def responses(self) -> list[tuple[float, ...]]:
@@ -103,6 +115,22 @@ class ShapedFlame(Shaped):
         return self.response(p, s)
 
 
+class AmplitudeFlame(ShapedFlame):
+    """The same with gain and lag that follow the run's loudness, the square of the flame's input:
+    what a describing function says of a flame that answers otherwise to a louder sound."""
+
+    form = "amplitude"
+    besides = tuple(Parameter(f"shaped_flame.loud{j}", "1", scale=1e-2) for j in (0, 1, 2, 3))
+
+    def flame(self, p: Values, at: Conditions, s: Any) -> Any:
+        lag = np.abs(1j * at.omega[:, None] + self.corner) / (np.sqrt(2) * self.corner)
+        loud = (np.abs(at.velocity[:, :1]) / (lag * self.setting.velocity)) ** 2 - 1.0
+        shares: Sequence[Any] = [p[q.name] for q in self.besides]
+        step = self.step(s)
+        linear, square = shares[0] + step * shares[1], shares[2] + step * shares[3]
+        return self.response(p, s) * (linear * loud + square * loud**2 + 1.0)
+
+
 class ShapedActuator(Shaped):
     """Any smooth linear response of the speaker, and its distortion."""
 
@@ -127,12 +155,17 @@ class ShapedSensor(Shaped):
     """Any smooth linear response of the velocity's measurement, and a share of the pressure."""
 
     location = "sensor"
-    besides = tuple(Parameter(f"shaped_sensor.pressure{j}", "1", scale=1e-3) for j in (0, 1, 2))
+    shares = tuple(Parameter(f"shaped_sensor.pressure{j}", "1", scale=1e-3) for j in (0, 1, 2))
+
+    def of_the_setting(self) -> tuple[Parameter, ...]:
+        return self.shares if self.setting.pressure else ()
 
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        if not self.setting.pressure:
+            return y * self.response(p, s)
         step = self.step(s)
         leak = as_velocity(at, s, upper_pressure(at, s))
-        shares: Sequence[Any] = [p[q.name] for q in self.besides]
+        shares: Sequence[Any] = [p[q.name] for q in self.shares]
         passed = shares[0] + step * shares[1] + step * step * shares[2]
         return with_leak(at, y * self.response(p, s), leak * passed)
 
@@ -142,9 +175,10 @@ class ModalSensor(ShapedSensor):
 
     form = "modal"
 
-    def of_modes(self, modes: int) -> tuple[Parameter, ...]:
-        names = (f"shaped_sensor.ratio{i}" for i in range(2, modes + 1))
-        return tuple(Parameter(name, "1", scale=1e-2) for name in names)
+    def of_the_setting(self) -> tuple[Parameter, ...]:
+        others = range(2, self.setting.modes + 1)
+        ratios = (Parameter(f"shaped_sensor.ratio{i}", "1", scale=1e-2) for i in others)
+        return (*super().of_the_setting(), *ratios)
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         first, *others = modes
@@ -282,6 +316,7 @@ class ShapedExperiment(Shaped):
 PIECES: tuple[type[Shaped], ...] = (
     ShapedForward,
     ShapedFlame,
+    AmplitudeFlame,
     ShapedNonlinearity,
     ShapedActuator,
     CutActuator,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from identify.dataset import Dataset
-from identify.effects.shaped import CHANCES, PIECES, Shaped, ShapedMemory
+from identify.effects.shaped import CHANCES, PIECES, Setting, Shaped, ShapedMemory
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits, no_better
 from identify.results import Whereabouts
@@ -23,6 +23,7 @@ from identify.trace.contests import joins, part_of
 from identify.trace.stages import (
     ROUGH,
     known_sizes,
+    knows_pressure,
     renamed,
     shares_of,
     try_effects,
@@ -71,7 +72,13 @@ def shaped(
 ) -> list[Tried]:
     """The pieces of each place, started from the declared fit and from what the best of `tried`
     make of the declared model; best first."""
-    every = (piece(data.free_hz, structure.mode_count) for piece in shapes)
+    setting = Setting(
+        data.free_hz,
+        structure.mode_count,
+        known_sizes(data, base).velocity_amplitude,
+        knows_pressure(data),
+    )
+    every = (piece(setting) for piece in shapes)
     differing = first_of_each(every, lambda p: p.parameters)  # of one mode two are the same
     pieces = [p for p in differing.values() if usable(p, data, structure)]
     best = sorted((t for t in tried if t.plausible), key=lambda t: t.fit.chi2)[:2]

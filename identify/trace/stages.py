@@ -515,11 +515,15 @@ def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float]) -> Spread |
     return fit_scatter(*item)
 
 
+def knows_pressure(data: Dataset) -> bool:
+    """Whether a pressure was measured beside the velocity."""
+    return any(np.any(b.at.pressure != 0) for b in data.fit)
+
+
 def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
     """Whether the effect can be added to this declared model and asked of these data."""
     if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
         return False
     if effect.mode_count not in (None, structure.mode_count):
         return False
-    pressure = any(np.any(b.at.pressure != 0) for b in data.fit)
-    return not ("pressure" in effect.needs and not pressure)
+    return "pressure" not in effect.needs or knows_pressure(data)
