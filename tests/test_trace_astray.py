@@ -215,7 +215,7 @@ def test_what_the_fit_mostly_absorbs_starts_with_what_stands_for_it(tmp_path: Pa
     form = by_key("flame_dynamics:second_time_scale")
     larger = ready.structure.with_effects(form)
     shapes = form.shapes(known_sizes(ready.data, base))
-    rows = [row for _, row in scan(ready.structure, ready.data, base, form, shapes)[:4]]
+    rows = [row for _, row, _ in scan(ready.structure, ready.data, base, form, shapes)[:2]]
     thetas = stepped(ready.structure, ready.data, base, form, rows)
     fit = fit_orbits(larger, ready.data, np.stack(thetas), continuation=(0.0,))
     assert tried((form,), fit, ready.data).explains

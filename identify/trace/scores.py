@@ -3,8 +3,8 @@
 A tangent is projected off those of the fitted parameters, so that what the fit can absorb is not
 counted as evidence. An effect whose shape is unknown where its size is zero (the frequency of a
 mode that takes no part) is tested at one shape after the other: to start from, never as evidence.
-A start is a step of all unknowns together: the fit mostly absorbs nearly all of an effect, and the
-effect beside what had stood for it leaves far more than there was.
+To start from is a step of all unknowns together too: where the fit absorbs nearly all of an effect,
+the effect beside what had stood for it leaves far more than there was.
 """
 
 from collections.abc import Sequence
@@ -72,9 +72,9 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
 
 def scan(
     structure: Structure, data: Dataset, fit: Fit, effect: Effect, shapes: Sequence[Sequence[float]]
-) -> list[tuple[float, FloatArray]]:
-    """What a small effect of each shape (`Effect.shapes`) would take off χ², and the shape's
-    internal values; the best first, of neighbours within 8 % only the better."""
+) -> list[tuple[float, FloatArray, FloatArray]]:
+    """What a small effect of each shape (`Effect.shapes`) takes off χ², and its internal values
+    without and with a size; the best first, of neighbours within 8 % only the better."""
     larger = structure.with_effects(effect)
     rows = np.stack([effect.to_internal(shape) for shape in shapes])
     sized = np.array([value == 0 for value in shapes[0]])
@@ -90,11 +90,13 @@ def scan(
         tangent = J[:, count:][:, sized]
         rest = tangent - Q @ (Q.T @ tangent)
         size = np.linalg.lstsq(rest, -rho, rcond=None)[0]
-        found.append((float(rho @ rho - np.sum((rho + rest @ size) ** 2)), row))
-    out: list[tuple[float, FloatArray]] = []
-    for drop, row in sorted(found, key=lambda item: -item[0]):
-        if all(np.abs(row[~sized] - other[~sized]).max() > 0.08 for _, other in out):
-            out.append((drop, row))
+        large = row.copy()
+        large[sized] = size
+        found.append((float(rho @ rho - np.sum((rho + rest @ size) ** 2)), row, large))
+    out: list[tuple[float, FloatArray, FloatArray]] = []
+    for drop, row, large in sorted(found, key=lambda item: -item[0]):
+        if all(np.abs(row[~sized] - other[~sized]).max() > 0.08 for _, other, _ in out):
+            out.append((drop, row, large))
     return out
 
 

@@ -45,7 +45,8 @@ PROMISED = 0.4  # share of χ² that a small effect would take away: refitted st
 OF_MODES = 48  # starts of one more mode, which may be anywhere and of either sign
 RIVAL_FORMS = 2  # of an effect that are led in from afar where another explains the data
 OWN = 6  # starting values of an effect that are all led in from afar
-SHAPES = 4  # so many are started from of an effect whose shape is unknown
+SHAPES = 4  # so many are started from of an effect whose shape is unknown …
+STEPPED = 2  # … and from so many with a step of all unknowns
 ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 NO_RIVAL = 30.0  # times what noise leaves: what promises no less is none of what explains the data
 FINE = 0.015  # share of noise below which all harmonics are looked at
@@ -143,9 +144,12 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
         np.r_[beside(task.structure, task.base.theta, task.data, task.effect, values), row]
         for values, row in zip(task.proposals, inner, strict=True)
     ]
-    thetas += task.small
     first = task.shares[0]
-    starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
+    if task.effect.neutral() is None:
+        starts = coarse(larger, task.seen, thetas, 2 * first)[:3]
+        starts += coarse(larger, task.seen, task.small, 2 * first)[:1]
+    else:
+        starts = coarse(larger, task.seen, [*thetas, *task.small], 2 * first)[:3]
     if task.richer is not None:
         begun = every_start(task.richer, task.rough)[:6]
         rows = renamed(task.effect, larger, task.richer, [s.theta for s in begun])
@@ -194,16 +198,15 @@ def _promise(task: _Task) -> _Task:
     """With what a small effect would take off χ² by the base fit's tangents, and unknowns with it:
     never worse than without, where it has a neutral point."""
     neutral, shapes = task.effect.neutral(), task.effect.shapes(task.known)
-    promise, rows = 0.0, []
-    small: list[FloatArray] = []
+    promise, rows, sized = 0.0, list[FloatArray](), list[FloatArray]()
     if neutral is not None:
-        rows = [task.effect.to_internal(neutral)]
-        small = [np.r_[task.base.theta, rows[0]]]
+        rows = sized = [task.effect.to_internal(neutral)]
         promise = 0.0 if task.score is None else task.score.drop
     elif shapes and task.base.converged:
         found = scan(task.structure, task.data, task.base, task.effect, shapes)[:SHAPES]
-        rows = [row for _, row in found]
-        promise = max((drop for drop, _ in found), default=0.0)
+        rows, sized = [row for _, row, _ in found[:STEPPED]], [large for *_, large in found]
+        promise = max((drop for drop, *_ in found), default=0.0)
+    small = [np.r_[task.base.theta, row] for row in sized]
     if neutral is None or promise > PROMISED * task.base.chi2:
         small += stepped(task.structure, task.data, task.base, task.effect, rows)
     return replace(task, promise=promise, small=tuple(small))
