@@ -46,10 +46,10 @@ def true_values() -> dict[str, float]:
 
 
 @numba.njit
-def _step_through(frequency_hz, amplitude, pole, skip, count, every, h):  # type: ignore[no-untyped-def]
+def _step_through(frequency_hz, amplitude, pole, warm, skip, count, every, h):  # type: ignore[no-untyped-def]
     """Fourth-order Runge–Kutta; every `every`-th velocity after `skip` steps."""
-    w2 = (2 * np.pi * FREQUENCIES) ** 2
-    loss = 2 * DAMPING * 2 * np.pi * FREQUENCIES
+    w2 = (2 * np.pi * FREQUENCIES * warm[0]) ** 2
+    loss = 2 * DAMPING * warm[1] * np.sqrt(w2)
     omega = 2 * np.pi * frequency_hz
     x = np.array([0.0, 0.0, 1e6, 0.0, 0.0])
     k = np.zeros((4, 5))
@@ -76,10 +76,15 @@ def _step_through(frequency_hz, amplitude, pole, skip, count, every, h):  # type
 
 @lru_cache(maxsize=64)
 def velocity(
-    frequency_hz: float, amplitude: float, seconds: float, rate: float, pole: float = POLE
+    frequency_hz: float,
+    amplitude: float,
+    seconds: float,
+    rate: float,
+    pole: float = POLE,
+    warm: tuple[float, float] = (1.0, 1.0),
 ) -> FloatArray:
     """Settled velocity under u = F sin ωt, with phase zero at the first sample; `pole` (rad/s) is
-    the flame's.
+    the flame's, `warm` the factors on all frequencies and dampings.
 
     100 kHz steps: (ωh)⁵ of the third harmonic is 4e-8; five seconds of settling, e^{-5·5.9} of
     the free cycle's own rate, leave 1e-12.
@@ -88,4 +93,4 @@ def velocity(
     h = 1.0 / (rate * every)
     skip = round(5.0 / h)
     count = round(seconds * rate)
-    return np.asarray(_step_through(frequency_hz, amplitude, pole, skip, count, every, h))
+    return np.asarray(_step_through(frequency_hz, amplitude, pole, warm, skip, count, every, h))

@@ -1,5 +1,6 @@
 """The whole way from recordings to parameters, on data stepped by an independent integrator."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,14 @@ import pytest
 import identify
 from daq.importers import open_campaign
 from identify.assess import lack_of_fit_p, predict, validation_p
+from identify.effects import CATALOGUE
+from identify.effects.shaped import (
+    AmplitudeFlame,
+    ModalSensor,
+    ShapedFlame,
+    ShapedForward,
+    ShapedNonlinearity,
+)
 from identify.executor import InProcess
 from identify.fit import Fit
 from identify.harmonics import RecordError, fit_harmonics, measure, refine_frequency
@@ -15,11 +24,12 @@ from identify.identification import prepare
 from identify.load import load_campaign
 from identify.record import Campaign, Medium, Run, Signal
 from identify.start import fit_declared, fit_from_data
+from identify.trace import search
 from identify.trace.places import shaped, whereabouts
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
 from simulated_rig.random_rigs import random_campaign, random_rig
-from tests.identify_rig import POLE, true_values, velocity
+from tests.identify_rig import POLE, FloatArray, true_values, velocity
 from tests.trace_material import record
 
 RATE = 5000.0
@@ -28,16 +38,29 @@ CONDITIONS = ((164.0, 2.0e10), (166.0, 1.0e10), (168.0, 0.6e10), (171.0, 0.8e10)
 MORE = (*CONDITIONS, (165.0, 1.2e10), (167.0, 2.0e10), (172.0, 2.0e10), (175.0, 1.2e10))
 
 
-def campaign(noise: float, seed: int = 1, slower: float = 0.0) -> Campaign:
-    """Forced runs of one second as a velocity channel, white noise of that share of 2.4e6; with
-    `slower`, the share that the flame's corner loses in a run of that size, more runs."""
+def slower(i: int, f: float, a: float) -> FloatArray:
+    """A flame whose corner is the lower the louder the run."""
+    loud = 2 * float(np.mean(velocity(f, a, 1.0, RATE) ** 2)) / 2.4e6**2
+    return velocity(f, a, 1.0, RATE, POLE * (1 - 0.002 * loud))
+
+
+def warmer(i: int, f: float, a: float) -> FloatArray:
+    """A tube that warms: its frequencies by half a per cent, its dampings by eight."""
+    done = float(1 - np.exp(-i / 9 / 0.4))
+    return velocity(f, a, 1.0, RATE, warm=(1 + 0.005 * done, 1 + 0.08 * done))
+
+
+def campaign(
+    noise: float,
+    seed: int = 1,
+    recorded: Callable[[int, float, float], FloatArray] = lambda i, f, a: velocity(f, a, 1.0, RATE),
+    conditions: tuple[tuple[float, float], ...] = CONDITIONS,
+) -> Campaign:
+    """Forced runs of one second as a velocity channel, white noise of that share of 2.4e6."""
     rng = np.random.default_rng(seed)
     runs = []
-    for i, (f, a) in enumerate(MORE if slower else CONDITIONS):
-        y = velocity(f, a, 1.0, RATE)
-        if slower:
-            loud = 2 * float(np.mean(y**2)) / 2.4e6**2
-            y = velocity(f, a, 1.0, RATE, POLE * (1 - slower * loud))
+    for i, (f, a) in enumerate(conditions):
+        y = recorded(i, f, a)
         t = np.arange(y.size) / RATE
         signals = {
             "v": Signal(y + noise * 2.4e6 * rng.standard_normal(y.size), "velocity", "m/s"),
@@ -102,12 +125,30 @@ def test_clean_data_show_no_discrepancy() -> None:
 
 def test_a_flame_that_is_slower_when_it_is_louder_is_placed() -> None:
     """Its describing function is no filter and no characteristic, and lies in the flame alone."""
-    ready = prepare(campaign(noise=3e-4, slower=0.002))
+    ready = prepare(campaign(3e-4, recorded=slower, conditions=MORE))
     base = fit_from_data(ready.structure, ready.data)
-    pieces = shaped(ready.structure, ready.data, base, [], InProcess(), lambda share, text: None)
+    some = (ShapedForward, ShapedFlame, AmplitudeFlame, ShapedNonlinearity, ModalSensor)
+    pieces = shaped(
+        ready.structure, ready.data, base, [], InProcess(), lambda share, text: None, some
+    )
     found = whereabouts(pieces, [], base)
     assert found.likely == ("flame",), found.words
     assert found.left["flame"] < 0.1 * base.chi2_per_dof
+
+
+def test_a_tube_that_warms_is_traced() -> None:
+    """Frequencies and dampings on one course: no drift of one thing explains them."""
+    ready = prepare(campaign(3e-4, recorded=warmer, conditions=MORE))
+    base = fit_from_data(ready.structure, ready.data)
+    drifts = [e for e in CATALOGUE if e.name == "parameter_drift"]
+    found = search(ready.structure, ready.data, base, catalogue=drifts, depth=1)
+    (best,) = (t for t in found.tried if t.explains)
+    assert best.key_of_forms == ("parameter_drift:warming",)
+    truth = {"frequency_change": 0.005, "damping_change": 0.08, "settling_time": 0.4}
+    for name, value in truth.items():
+        known = best.estimates[f"parameter_drift.{name}"]
+        assert abs(known.value - value) < 4 * known.stderr, name
+        assert known.stderr < 0.2 * value
 
 
 @pytest.mark.parametrize(("forced", "says_little"), [(1, True), (4, False)])

@@ -1,5 +1,6 @@
 """The experiment: parameters that change in the course of a campaign."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -112,6 +113,33 @@ class SeveralDrifts(Effect):
         return modes
 
 
+class Warming(Effect):
+    """All frequencies and dampings change together towards a last value, as the tube's temperature
+    does; from where the frequencies alone came nearest."""
+
+    name, location, form, refines = "parameter_drift", "experiment", "warming", True
+    frequency = Drift("frequency_settling")
+    parameters = (
+        *SeveralDrifts.parameters[:2],
+        frequency.parameters[1],
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(change, 0.0, time) for change, time in self.frequency.starts(known)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        size, damping, time = (q.name for q in self.parameters)
+        change = values.get(size, values.get("parameter_drift.relative_change", 0.0))
+        if not other.form.startswith(("frequency", "several")):
+            change = 0.0
+        return [(change, values.get(damping, 0.0), values.get(time, q)) for q in (0.3, 1.0)]
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        size, damping, time = (p[q.name] for q in self.parameters)
+        modes = changed(modes, "frequency", settling(at, size, time))
+        return changed(modes, "damping", settling(at, damping, time))
+
+
 class FlameDrift(Effect):
     """The flame's linear answer to the velocity changes over the campaign.
 
@@ -157,4 +185,5 @@ EFFECTS: tuple[Effect, ...] = (
     FlameDrift("flame_pole"),
     FlameDrift("flame_rate"),
     SeveralDrifts(),
+    Warming(),
 )

@@ -60,7 +60,8 @@ class HigherOrder(Effect):
 class Saturation(Effect):
     """The flame's input saturates before the declared characteristic acts on it.
 
-    ``tanh``: L tanh(w/L); ``algebraic``: w/√(1 + (w/L)²).
+    ``tanh``: L tanh(w/L); ``algebraic``: w/√(1 + (w/L)²); ``arctan``: L arctan(w/L); ``rational``:
+    w/(1 + |w|/L).
     """
 
     name, location = "nonlinearity_shape", "nonlinearity"
@@ -68,6 +69,7 @@ class Saturation(Effect):
 
     def __init__(self, form: str) -> None:
         self.form = form
+        self.refines = form in ("arctan", "rational")
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.3 / known.flame_input_amplitude,), (1.0 / known.flame_input_amplitude,)]
@@ -76,13 +78,21 @@ class Saturation(Effect):
         inverse = p["nonlinearity_shape.inverse_level"]
         if self.form == "tanh":
             return lambda w: n(dual.tanh(w * inverse) / inverse)
+        if self.form == "arctan":
+            return lambda w: n(dual.arctan(w * inverse) / inverse)
+        if self.form == "rational":
+            return lambda w: n(w / (dual.absolute(w * inverse) + 1.0))
         return lambda w: n(w / dual.sqrt((w * inverse) ** 2 + 1.0))
+
+
+def _rational(x: Any) -> Any:
+    return x / (dual.absolute(x) + 1.0)
 
 
 class SaturatingGain(Effect):
     """The linear term alone saturates, N(w) − w + L g(w/L), beside the declared higher powers.
 
-    ``tanh_gain``: g = tanh; ``arctan_gain``: g = arctan.
+    ``tanh_gain``: g = tanh; ``arctan_gain``: g = arctan; ``rational_gain``: g(x) = x/(1 + |x|).
     """
 
     name, location = "nonlinearity_shape", "nonlinearity"
@@ -90,7 +100,8 @@ class SaturatingGain(Effect):
 
     def __init__(self, form: str) -> None:
         self.form = form
-        self.law = dual.tanh if form == "tanh_gain" else dual.arctan
+        laws = {"tanh_gain": dual.tanh, "arctan_gain": dual.arctan, "rational_gain": _rational}
+        self.law, self.refines = laws[form], form == "rational_gain"
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(q / known.flame_input_amplitude,) for q in (0.2, 0.7, 2.0)]
@@ -221,8 +232,11 @@ EFFECTS: tuple[Effect, ...] = (
     HigherOrder((4, 5)),
     Saturation("tanh"),
     Saturation("algebraic"),
+    Saturation("arctan"),
+    Saturation("rational"),
     SaturatingGain("tanh_gain"),
     SaturatingGain("arctan_gain"),
+    SaturatingGain("rational_gain"),
     QuadraticOdd(),
     DeadZone(),
     SoftDeadZone(),
