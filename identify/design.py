@@ -40,6 +40,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ENOUGH = 6 * EVIDENCE  # Δχ² to be expected of a pair, with a margin for what is linearised here
 LITTLE = 2.0  # Δχ² not worth a run
+TELLING = 4.0  # Δχ² of two standard errors: what tells less tells nothing
 MOST_RUNS = 6
 LENGTHS = (1.0, 2.0, 4.0)  # record lengths tried, over the campaign's own
 MOST_RIVALS = 3
@@ -409,10 +410,11 @@ def _reason(names: Sequence[str], chosen: Chosen, verdict: str) -> str:
         "they differ most, and where the parameters are fixed best."
     )
     end = "is expected to leave" if least >= EVIDENCE else "would leave no more than"
+    little = ", which hardly tells them apart; nothing within the rig's reach does"
     return (
         f"{begin} A free run, then {listed}; records of {chosen.options[0].record_s:g} s, about "
         f"{chosen.seconds / 60:.1f} min of rig time. After that the wrong one of any two {end} "
-        f"a χ² higher by {least:.3g}, whatever its parameters."
+        f"a χ² higher by {least:.3g}, whatever its parameters{little if least < TELLING else ''}."
     )
 
 

@@ -307,7 +307,11 @@ def _judge(
             said = f"Adding {words} explains the data; no rival does."
             if best.spread is not None and best.spread.objection:
                 said += f" No law comes near: that {best.spread.objection} is put down to luck."
-            return "traced", best, said + "".join(forms)
+            if best.spread is not None:
+                said += (
+                    " Single runs lie at random within that spread, and are predicted no better."
+                )
+            return "traced", best, said + "".join(dict.fromkeys(forms))
         names = ", ".join(t.words for t in others)
         return "ambiguous", best, f"{words} explains the data, and so does: {names}."
     least = declared.fit.chi2  # what leaves more with an effect than without has lost its way

@@ -247,6 +247,19 @@ class Candidate:
     def key(self) -> str:
         return " + ".join(self.effects)
 
+    @property
+    def named(self) -> list[str]:
+        """Each effect with its form: ``flame_dynamics:pole``."""
+        pairs = zip(self.effects, self.forms, strict=True)
+        return [f"{effect}:{form}" if form else effect for effect, form in pairs]
+
+    @property
+    def objection(self) -> str:
+        """Why it does not explain the data; empty: it does."""
+        if not self.adequate:
+            return "misfit left"
+        return "" if self.plausible else self.note or "implausible"
+
     def to_json(self) -> dict[str, Any]:
         return {
             "effects": list(self.effects),
@@ -312,6 +325,9 @@ PLACES = {
 }
 
 
+PARTLY = 10.0  # χ²/dof that a place's shape leaves, beyond which it is not what is missing
+
+
 @dataclass(frozen=True)
 class Whereabouts:
     """Where an unexplained misfit lies: what is left of it with a freely shaped piece, or a known
@@ -321,12 +337,15 @@ class Whereabouts:
     places that are not ruled out, none where no place takes up most of the misfit. A place where
     nothing could be fitted is not in `left`, and not ruled out unless another explains it all.
     `from_run_to_run`: no law takes it up, but runs that each deviate at a likely place do.
+    `together`: χ²/dof of several effects that leave far less than any one place; the likely places
+    are then theirs, all of them (None: one place, or any of several).
     """
 
     likely: tuple[str, ...]
     left: Mapping[str, float]
     before: float
     from_run_to_run: bool = False
+    together: float | None = None
 
     @property
     def words(self) -> str:
@@ -339,10 +358,20 @@ class Whereabouts:
         sizes = f"χ²/dof {self.before:.3g}; with a free shape or one effect in one place: {listed}"
         if not self.likely:
             return f"No place in the loop takes it up by itself ({sizes})."
-        sure = "lies" if len(self.likely) == 1 else "may lie"
+        if self.together is not None:
+            where = " and the ".join(PLACES[p] for p in self.likely)
+            return (
+                f"No one place takes it up; effects of the {where} together leave χ²/dof "
+                f"{self.together:.3g} ({sizes})."
+            )
+        partly = min(self.left.values()) > PARTLY and not self.from_run_to_run
+        sure = "lies" if len(self.likely) == 1 and not partly else "may lie"
         where = " or the ".join(PLACES[p] for p in self.likely)
         how = "differs from run to run and " if self.from_run_to_run else ""
-        return f"What is missing {how}{sure} in the {where} ({sizes})."
+        rest = (
+            " No shape there takes it all up: it is of a kind that none follows." if partly else ""
+        )
+        return f"What is missing {how}{sure} in the {where} ({sizes}).{rest}"
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -350,6 +379,7 @@ class Whereabouts:
             "chi2_per_dof": {place: number(left) for place, left in self.left.items()},
             "before": number(self.before),
             "from_run_to_run": self.from_run_to_run,
+            "together": self.together,
         }
 
 

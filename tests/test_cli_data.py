@@ -4,9 +4,13 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 
+from daq.service.commands.analysis import show_quality
+from identify.results import Diagnosis, QualityFlag
 from tests.service_data import make_folder
 
 
@@ -94,6 +98,22 @@ def test_config_show_says_where_from(
         "value": 9123,
         "source": "environment ENTRAIN_SERVER__PORT",
     }
+
+
+def test_what_is_alike_in_several_runs_is_said_once(capfd: pytest.CaptureFixture[str]) -> None:
+    """Six lines of hum in eleven runs had been sixty rows."""
+    found = SimpleNamespace(
+        quality=[
+            QualityFlag(run, "mains_hum", f"line at {hz} Hz, {size} Pa; {n} × 50 Hz: look")
+            for run, hz, size in (("r1", 50.01, 15.1), ("r2", 49.98, 14.0), ("r3", 50.0, 2.25))
+            for n in (1, 3)
+        ]
+    )
+    show_quality(cast(Diagnosis, found))
+    said = capfd.readouterr().out
+    assert said.count("and 2 more") == 2
+    assert said.count("line at 50.01 Hz") == 2
+    assert "49.98" not in said
 
 
 def test_help_is_quick_and_loads_no_heavy_library() -> None:

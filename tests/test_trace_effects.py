@@ -698,6 +698,23 @@ def test_a_place_that_could_not_be_shaped_is_not_ruled_out() -> None:
     assert whereabouts([explains], [], fitted(10, 500.0)).likely == ("sensor",)
 
 
+def test_effects_of_two_places_that_leave_far_less_than_any_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each place's shape only comes near to what is not in it alone."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    one = replace(tried_as(fitted(11, 60.0), "channel_mismatch:skew"), fit_p=0.0)
+    both = tried_as(fitted(12, 3.0), "acoustic_mode:mode", "parameter_drift:frequency")
+    three = tried_as(fitted(13, 2.6), "acoustic_mode:mode", "flame_delay", "channel_mismatch:skew")
+    found = whereabouts([one], [both, three], fitted(10, 500.0))
+    assert (found.likely, found.together) == (("forward", "experiment"), 3.0)
+    assert "the forward path and the course of the experiment together" in found.words
+    assert found.to_json()["together"] == 3.0
+    # what leaves little less does so for having more numbers
+    near = replace(one, fit=fitted(11, 20.0))
+    assert whereabouts([near], [both], fitted(10, 500.0)).together is None
+
+
 def test_unexplained_says_where(tmp_path: Path) -> None:
     """Without the candidate that it is, a flame delay ends as unexplained, on the flame's side."""
     ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})

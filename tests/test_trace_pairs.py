@@ -194,13 +194,19 @@ def a_further_mode(name: str, internal_stderr: float, **own: float) -> trace.Tri
 def test_without_the_flame_s_part_nothing_sings() -> None:
     """A set in which the singing mode's flame residue is not seen explains nothing."""
     assert a_further_mode("mode1.flame_residue", 3.0).plausible
-    assert not a_further_mode("mode1.flame_residue", 40.0).plausible
+    silent = a_further_mode("mode1.flame_residue", 40.0)
+    assert not silent.plausible
+    assert silent.implausibility.startswith(
+        "mode1.flame_residue is within its own error of nothing"
+    )
 
 
 def test_what_nobody_knows_has_been_stopped_by_nothing() -> None:
     """A damping at the edge of its range is told from one inside, or else is no objection."""
     lowest = by_key("acoustic_mode:mode").parameters[1].lower
-    assert not a_further_mode("acoustic_mode.damping", 0.3, damping=lowest).plausible
+    stopped = a_further_mode("acoustic_mode.damping", 0.3, damping=lowest)
+    assert not stopped.plausible
+    assert stopped.implausibility.startswith("acoustic_mode.damping is at the edge of its range")
     assert a_further_mode("acoustic_mode.damping", 25.0, damping=lowest).plausible
 
 

@@ -36,6 +36,7 @@ from identify.trace.tried import tried as as_tried
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave …
 LITTLE = 0.6  # … and any that is not ruled out
+FAR_LESS = 10.0  # times less χ² than any one place leaves: two places then
 STARTS, AFAR = 3, 4  # that are led on, of each kind; that are looked at from afar
 PLACES, PARENTS = 2, 2  # of which two effects are sought together, and from how many first ones
 
@@ -169,9 +170,23 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
         left = own | {place: other for place, other in left.items() if place not in own}
         return Whereabouts(tuple(own), left, base.chi2_per_dof, from_run_to_run=True)
     likely = _likely(list(places.values()), base.chi2_per_dof)
+    several = _several(tries)
+    if several is not None and places:
+        together, best = several.fit.chi2_per_dof, next(iter(left.values()))
+        if together < best / FAR_LESS:
+            both = tuple(dict.fromkeys(e.location for e in several.effects))
+            return Whereabouts(both, left, base.chi2_per_dof, together=together)
     if pieces and likely and not places[likely[0]].adequate:  # no shape there says nothing of it
         likely += tuple(dict.fromkeys(p.location for p in PIECES if p.location not in left))
     return Whereabouts(likely, left, base.chi2_per_dof)
+
+
+def _several(tries: Sequence[Tried]) -> Tried | None:
+    """The fewest effects of different places that leave nearly as little as any number of them."""
+    laws = [t for t in tries if t.plausible and t.spread is None and t.fit.converged]
+    near = [t for t in laws if t.fit.chi2_per_dof < CLEARLY * min(o.fit.chi2_per_dof for o in laws)]
+    best = min(near, key=lambda t: (len(t.effects), misfit(t)), default=None)
+    return best if best is not None and len({e.location for e in best.effects}) > 1 else None
 
 
 def _deviations(spreads: Sequence[Tried], laws: Sequence[Tried]) -> dict[str, Tried]:

@@ -27,6 +27,7 @@ K = TypeVar("K", bound=Hashable)
 
 ALPHA = 1e-3  # false-alarm probability of each significance test
 GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
+MODAL = 0.7  # damping ratio up to which a mode is one
 OVERDAMPED = 0.15  # damping ratio of a mode that has strayed, where a misfit is left …
 VISIBLE = 10.0  # … of so much χ²/dof
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
@@ -147,8 +148,13 @@ class Tried:
 
     @property
     def plausible(self) -> bool:
+        return not self.implausibility
+
+    @property
+    def implausibility(self) -> str:
+        """Why it is no explanation however little it leaves, in words; empty: it is one."""
         if self.objection:
-            return False
+            return self.objection
         known = self.estimates
         values = {name: e.value for name, e in known.items()}
         own = [q for e in self.effects for q in e.parameters]
@@ -156,14 +162,21 @@ class Tried:
         open_ = {
             q.name for q in own if q.kind == "positive" and known[q.name].stderr > values[q.name]
         }
-        inside = all(q.plausible(values[q.name]) or q.name in open_ for q in own)
+        outside = (q.name for q in own if not (q.plausible(values[q.name]) or q.name in open_))
         # without the flame's part in the mode that sings, nothing makes it sing
         located = ["mode1.flame_residue", *(n for e in self.effects for n in e.located)]
-        seen = all(known[n].stderr <= abs(values[n]) for n in located)
-        if not (inside and seen):
-            return False
-        modes = range(1, self.fit.structure.mode_count + 1)
-        return all(values[f"mode{i}.damping"] < 0.7 for i in modes)
+        unseen = (n for n in located if not known[n].stderr <= abs(values[n]))
+        dampings = (f"mode{i}.damping" for i in range(1, self.fit.structure.mode_count + 1))
+        overdamped = (n for n in dampings if not values[n] < MODAL)
+        for names, what in (
+            (outside, "at the edge of its range"),
+            (unseen, "within its own error of nothing"),
+            (overdamped, "no mode's"),
+        ):
+            name = next(names, None)
+            if name is not None:
+                return f"{name} is {what} ({values[name]:.3g})"
+        return ""
 
 
 def astray(fit: Fit) -> bool:
@@ -381,7 +394,8 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
 def _note(t: Tried) -> str:
     if not t.fit.converged:
         return t.fit.reason
+    if not t.plausible:
+        return t.implausibility
     if t.spread is None:
         return ""
-    left = "leaves more than noise" if t.adequate and not t.leaves_noise else ""
-    return t.objection or left
+    return "leaves more than noise" if t.adequate and not t.leaves_noise else ""

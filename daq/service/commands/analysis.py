@@ -1,5 +1,6 @@
 """`entrain identify`, `diagnose`: in this process, with a progress bar."""
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -15,7 +16,6 @@ from daq.service.commands.common import (
     HtmlOption,
     JsonOption,
     StoreOption,
-    chance,
     number,
     open_store,
     out,
@@ -25,7 +25,7 @@ from daq.service.commands.common import (
 
 if TYPE_CHECKING:
     from identify.record import Campaign
-    from identify.results import Diagnosis, Identification
+    from identify.results import Diagnosis, Identification, QualityFlag
 
 CampaignArgument = Annotated[str, typer.Argument(help="Campaign folder, or campaign id.")]
 Tell = Callable[[float, str], None]
@@ -258,22 +258,22 @@ def show_diagnosis(found: "Diagnosis") -> None:
             ("noise floor", number(found.noise_floor, 3), number(found.noise_floor, 3)),
             (
                 "noise and parameters' uncertainty",
-                number(before.expected_error, 3),
-                number(after.expected_error, 3),
+                number(before.expected_error, 3) if before.fit.converged else "not converged",
+                number(after.expected_error, 3) if after.fit.converged else "not converged",
             ),
         ),
     )
     if found.candidates:
         table(
             "candidates, best first",
-            ("effects", "where", "χ²/dof", "validation error", "p of the gain"),
+            ("effects", "where", "χ²/dof", "validation error", "objection"),
             (
                 (
-                    " +\n".join(c.effects),  # one a line: three would leave no room
+                    " +\n".join(c.named),  # one a line: three would leave no room
                     "\n".join(c.locations),
                     number(c.chi2_per_dof),
                     number(c.validation_error, 3),
-                    chance(c.p_value),
+                    c.objection,
                 )
                 for c in found.candidates[:8]
             ),
@@ -288,15 +288,29 @@ def show_diagnosis(found: "Diagnosis") -> None:
     if found.next_experiment:
         out.print(f"next experiment: {found.next_experiment['reason']}", markup=False)
         out.print("run it: --json FILE, then `entrain campaign run FILE`", markup=False)
+    elif found.verdict in ("ambiguous", "unexplained"):
+        out.print("next experiment: none within the rig's reach tells the nearest apart")
 
 
 def show_quality(found: "Identification | Diagnosis") -> None:
-    """Print what is wrong with recordings, if anything is."""
-    if found.quality:
+    """Print what is wrong with recordings, if anything is; what is alike in several runs once."""
+    alike: dict[tuple[str, ...], list[QualityFlag]] = {}
+    for q in found.quality:
+        said, _, last = q.detail.rpartition(";")
+        alike.setdefault((q.flag, q.severity, re.sub(r"[\d.]+", "#", said), last), []).append(q)
+    if alike:
         table(
             "data quality",
             ("run", "flag", "detail", "consequence"),
-            ((q.run, q.flag, q.detail, q.severity) for q in found.quality),
+            (
+                (
+                    first.run + (f"\nand {len(others)} more" if others else ""),
+                    first.flag,
+                    first.detail,
+                    first.severity,
+                )
+                for first, *others in alike.values()
+            ),
         )
 
 

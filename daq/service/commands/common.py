@@ -75,11 +75,6 @@ def number(value: float | None, digits: int = 4) -> str:
     return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}g}"
 
 
-def chance(p: float) -> str:
-    """A probability; what is too small for a double is said so."""
-    return "< 1e-300" if p < 1e-300 else number(p, 2)
-
-
 def write_json(place: Path | None, content: dict[str, Any]) -> None:
     """Write `content` to `place`, or to stdout for ``-``; nothing for None."""
     if place is None:
