@@ -102,6 +102,7 @@ BAD_INPUT = (
     ("drivers.errors", "SettingError"),
     ("drivers.errors", "DeviceNotFound"),
     ("identify.declare", "ModelError"),
+    ("identify.harmonics", "RecordError"),
     ("identify.load", "LoadError"),
 )
 FAILED = (("daq.errors", "DaqError"), ("drivers.errors", "DriverError"))

@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 from identify import assess, dataset, drive, harmonics, profile, quality, start
 from identify.dataset import Dataset
+from identify.declare import ModelError
 from identify.executor import InProcess
 from identify.fit import Fit, failed
 from identify.harmonics import Harmonics
 from identify.record import Campaign, DeclaredModel
 from identify.results import Identification
-from identify.structure import NONLINEARITIES, Structure
+from identify.structure import Structure
 from identify.trace import astray, try_effects
 
 FloatArray = npt.NDArray[np.float64]
@@ -43,28 +44,27 @@ def declared_structure(model: DeclaredModel) -> Structure:
 
     Raises
     ------
-    ValueError : a word of the declared model is not known; the message lists those that are.
+    ModelError : a word or number of the declared model is not known; says those that are.
     """
     flames = {"first_order_lowpass": 1, "second_order_lowpass": 2, "none": 0}
     delayed = model.flame.endswith("_delay")
     flame = model.flame.removesuffix("_delay").removesuffix("_with")
     if flame not in flames:
-        raise ValueError(
+        raise ModelError(
             f"declared_model.flame={model.flame!r} is not one of {sorted(flames)}, "
             "with or without '_with_delay'"
         )
-    if model.nonlinearity not in NONLINEARITIES:
-        raise ValueError(
-            f"declared_model.nonlinearity={model.nonlinearity!r} is not in {NONLINEARITIES}"
+    try:
+        return Structure(
+            mode_count=model.modes,
+            flame_order=int(model.options.get("flame_order", flames[flame])),
+            flame_delay=delayed,
+            nonlinearity=model.nonlinearity,
+            degree=model.nonlinearity_degree,
+            nodes=tuple(float(x) for x in model.options.get("nodes", ())),
         )
-    return Structure(
-        mode_count=model.modes,
-        flame_order=int(model.options.get("flame_order", flames[flame])),
-        flame_delay=delayed,
-        nonlinearity=model.nonlinearity,
-        degree=model.nonlinearity_degree,
-        nodes=tuple(float(x) for x in model.options.get("nodes", ())),
-    )
+    except ValueError as error:
+        raise ModelError(f"declared_model.{error}") from error
 
 
 def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
@@ -72,8 +72,9 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
 
     Raises
     ------
-    identify.harmonics.RecordError : a recording cannot be used; names run, channel and reason.
-    ValueError : no usable forced run, or a declared model that is not known.
+    identify.harmonics.RecordError : a recording cannot be used; names run, channel and reason. Or
+        none that was forced can: names what excludes each.
+    ModelError : a declared model that is not known.
     """
     chosen = structure or declared_structure(campaign.declared_model)
     found = quality.inspect(campaign)
@@ -83,10 +84,11 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
         for h in harmonics.measure_campaign(campaign, skip=sorted(found.excluded), tones=tones)
     ]
     if not any(h.kind == "forced" and h.role == "fit" for h in measured):
-        reasons = "; ".join(f"{f.run}: {f.flag}" for f in found.flags if f.run in found.excluded)
-        raise ValueError(
+        spoilt = [f for f in found.flags if f.run in found.excluded and f.severity == "excluded"]
+        why = dict.fromkeys(f"{f.run}: {f.flag} ({f.detail})" for f in spoilt)
+        raise harmonics.RecordError(
             f"campaign {campaign.title!r} has no usable forced run to fit on"
-            + (f" (excluded: {reasons})" if reasons else "; record at least one")
+            + (f"; excluded are {'; '.join(why)}" if why else "; record at least one")
         )
     mics = harmonics.microphones(campaign.runs[0])
     data = dataset.build(measured, campaign.medium, mics)

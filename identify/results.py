@@ -249,9 +249,10 @@ class Candidate:
 
     @property
     def named(self) -> list[str]:
-        """Each effect with its form: ``flame_dynamics:pole``."""
+        """Each effect; with its form, ``flame_dynamics:pole``, where two go by the same name."""
+        twice = len(set(self.effects)) < len(self.effects)
         pairs = zip(self.effects, self.forms, strict=True)
-        return [f"{effect}:{form}" if form else effect for effect, form in pairs]
+        return [f"{effect}:{form}" if twice and form else effect for effect, form in pairs]
 
     @property
     def objection(self) -> str:

@@ -1,6 +1,7 @@
 """Models declared in TOML: what they become, what is refused, and that they are what is fitted."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,15 @@ import pytest
 from typer.testing import CliRunner
 
 from daq.cli import app
+from daq.importers import open_campaign
 from identify.chances import chi2_tail, f_tail, rank_correlation
 from identify.declare import ModelError, described, read_model, structure_of
 from identify.effects import CATALOGUE
-from identify.identification import declared_structure, fit_structure
+from identify.harmonics import RecordError
+from identify.identification import declared_structure, fit_structure, prepare
+from identify.load import load_campaign
+from identify.record import DeclaredModel
+from identify.trace.stages import usable
 from tests.identify_coefficients import WIDE, clean, drawn
 
 CASE = Path(__file__).parent / "data" / "b-flame-delay"
@@ -63,6 +69,44 @@ def test_what_is_wrong_is_named_with_the_file(text: str, words: list[str], tmp_p
         read_model(file)
     for word in ["mine.toml", *words]:
         assert word in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("model", "words"),
+    [
+        (DeclaredModel(flame="n_tau"), r"declared_model.flame='n_tau' is not one of \['first_"),
+        (DeclaredModel(nonlinearity="cubic"), "declared_model.nonlinearity='cubic' is not one of"),
+        (DeclaredModel(nonlinearity_degree=1), "declared_model.nonlinearity_degree=1 is not an"),
+        (DeclaredModel(modes=0), "declared_model.modes=0 is not an integer >= 1"),
+    ],
+)
+def test_what_a_campaign_declares_wrongly_is_named(model: DeclaredModel, words: str) -> None:
+    with pytest.raises(ModelError, match=words):
+        declared_structure(model)
+
+
+def test_a_flame_without_a_pole_has_none_that_drifts() -> None:
+    """Such a declaration had ended every diagnosis with a KeyError."""
+    measured = load_campaign(open_campaign(CASE))
+    at_once = declared_structure(replace(measured.declared_model, flame="none"))
+    ready = prepare(measured, at_once)
+    drifts = [
+        e for e in CATALOGUE if e.name == "parameter_drift" and usable(e, ready.data, at_once)
+    ]
+    forms = {e.form for e in drifts}
+    assert "flame_input" in forms
+    assert not forms & {"flame_pole", "flame_rate"}
+
+
+def test_nothing_usable_says_why() -> None:
+    """Every run that is excluded, and for what."""
+    measured = load_campaign(open_campaign(CASE))
+    dead = tuple(
+        replace(r, signals={n: replace(s, values=0 * s.values) for n, s in r.signals.items()})
+        for r in measured.runs
+    )
+    with pytest.raises(RecordError, match="no usable forced run to fit on; excluded are .*dead"):
+        prepare(replace(measured, runs=dead))
 
 
 def test_two_lagrange_nodes_are_the_cubic_in_other_words() -> None:

@@ -153,6 +153,7 @@ class FlameDrift(Effect):
 
     def __init__(self, form: str) -> None:
         self.form = form
+        self.needs = () if form == "flame_input" else ("flame_pole",)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.01,), (-0.01,)]

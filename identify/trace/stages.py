@@ -529,4 +529,6 @@ def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
         return False
     if effect.mode_count not in (None, structure.mode_count):
         return False
+    if "flame_pole" in effect.needs and structure.flame_order == 0:
+        return False
     return "pressure" not in effect.needs or knows_pressure(data)
