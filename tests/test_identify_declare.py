@@ -105,7 +105,7 @@ def test_nothing_usable_says_why() -> None:
         replace(r, signals={n: replace(s, values=0 * s.values) for n, s in r.signals.items()})
         for r in measured.runs
     )
-    with pytest.raises(RecordError, match="no usable forced run to fit on; excluded are .*dead"):
+    with pytest.raises(RecordError, match=r"no usable forced run to fit on; excluded are .*dead"):
         prepare(replace(measured, runs=dead))
 
 
