@@ -41,6 +41,15 @@ def test_folder_arrives_in_physical_units(tmp_path: Path, store: RunStore) -> No
     assert run.signals["drive"].unit == "V"
 
 
+def test_fewer_bits_than_the_file_s_are_seen(tmp_path: Path, store: RunStore) -> None:
+    """Twelve bits, left-justified in sixteen: the tops of a sine had been taken for clipping."""
+    folder = write_folder(tmp_path / "twelve")
+    counts = int16(tones(166.0, 1.5))
+    write_wav(folder / "runs/f166.wav", (counts // 16 * 16).astype(np.int16))
+    signal = load_campaign(open_campaign(folder, store)).runs[1].signals["p1"]
+    assert signal.resolution == pytest.approx(16 * 10 / 32768 / 0.002, rel=1e-14)
+
+
 def test_float_wav_counts_full_scale_as_one(tmp_path: Path, store: RunStore) -> None:
     folder = write_folder(tmp_path / "floats")
     volts = tones(166.0, 1.5)

@@ -264,6 +264,9 @@ def show_diagnosis(found: "Diagnosis") -> None:
         ),
     )
     if found.candidates:
+        best, claimed = found.candidates[0], found.verdict in ("traced", "ambiguous")
+        as_good = {" + ".join(best.named), *best.equivalent_to} if claimed else set()
+        other = "the first is likelier" if claimed else "not the cause by itself"
         table(
             "candidates, best first",
             ("effects", "where", "χ²/dof", "validation error", "objection"),
@@ -273,7 +276,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
                     "\n".join(c.locations),
                     number(c.chi2_per_dof),
                     number(c.validation_error, 3),
-                    c.objection,
+                    c.objection or ("" if " + ".join(c.named) in as_good else other),
                 )
                 for c in found.candidates[:8]
             ),
