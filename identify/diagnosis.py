@@ -27,6 +27,7 @@ from identify.results import (
     Assessment,
     Candidate,
     Diagnosis,
+    QualityFlag,
     Residual,
     TracedEffect,
     Verdict,
@@ -40,6 +41,8 @@ Progress = Callable[[float, str], None]
 
 SHOWN = 12  # candidates in the report
 REFITTED = 6  # sets of effects that are fitted again where the data's covariances have changed
+FEW = 2  # numbers that a law may have without asking whether it stands for one run alone
+ALONE = "the declared model explains all runs but this one; record it again"
 DOUBTFUL = 0.05  # probability of a claim's lack of fit below which free shapes contest it
 
 
@@ -136,15 +139,25 @@ def diagnose(
         tried = trace.against_chance(tried, pieces())
         contesting = deviating(chosen) if chosen.spread else []
         verdict, chosen, explanation = _judge(declared, tried, data, [*pieces(), *contesting])
-    where = None
-    if verdict == "unexplained":
+    where, flags = None, ready.quality.flags
+    odd = _odd_run(ready, data, base, verdict, chosen, run)
+    if odd is not None:
+        name, chi2_per_dof = odd
+        verdict, chosen = "unexplained", None
+        explanation = (
+            f"Without run {name} the declared model explains all others (χ²/dof "
+            f"{chi2_per_dof:.3g}): one run alone is no evidence of a cause. Look for a fault of "
+            "its recording, and record it again; what comes back then is an effect."
+        )
+        flags = (*flags, QualityFlag(name, "contradicts_alone", ALONE))
+    elif verdict == "unexplained":
         asked = [*pieces(), *contesting]
         if not any(t.adequate and t.fit_p > DOUBTFUL for t in pieces()):
             asked += trace.remembering(ready.structure, data, base, run, placing)
             asked += deviating()
             tried, asked = trace.unrivalled(tried, asked), trace.unrivalled(asked, tried)
             verdict, chosen, explanation = _judge(declared, tried, data, asked)
-    if verdict == "unexplained":
+    if verdict == "unexplained" and odd is None:
         where = trace.whereabouts(asked, tried, base)
         explanation = f"{explanation} {where.words}"
     if tones and verdict in ("no_discrepancy", "traced"):
@@ -158,7 +171,7 @@ def diagnose(
     return Diagnosis(
         campaign=campaign.identifier or campaign.title,
         declared_model=campaign.declared_model,
-        quality=ready.quality.flags,
+        quality=flags,
         before=before,
         residual=residual,
         candidates=_candidates(tried, chosen, base),
@@ -170,6 +183,26 @@ def diagnose(
         explanation=explanation,
         whereabouts=where,
     )
+
+
+def _odd_run(
+    ready: Prepared,
+    data: Dataset,
+    base: Fit,
+    verdict: Verdict,
+    chosen: Tried | None,
+    run: Executor,
+) -> tuple[str, float] | None:
+    """The one run that alone contradicts the declared model, and χ²/dof of the others; asked where
+    nothing explains the data, or what does has much freedom."""
+    numbers = 0 if chosen is None else sum(len(e.parameters) for e in chosen.effects)
+    free = chosen is not None and (chosen.spread or len(chosen.effects) > 1 or numbers > FEW)
+    if not (verdict == "unexplained" or (free and verdict != "no_discrepancy")):
+        return None
+    count = len(ready.structure.parameters)
+    thetas = [base.theta] + ([] if chosen is None else [chosen.fit.theta[:count]])
+    found = trace.lone_run(ready.structure, data, thetas, run, anew=verdict == "unexplained")
+    return None if found is None else (found[0], found[1].chi2_per_dof)
 
 
 def _after(chosen: Tried, data: Dataset, noise_floor: float) -> Assessment:

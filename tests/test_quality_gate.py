@@ -413,6 +413,21 @@ def test_frequency_and_amplitude_that_were_not_asked_for(clean: Campaign) -> Non
     ]
 
 
+def test_one_drive_far_from_what_was_asked(clean: Campaign) -> None:
+    """By a fifth, where all others agree: the run is spoilt, whichever of the two is wrong; of two
+    such runs neither is."""
+    runs = list(clean.runs)
+    runs[3] = replace(runs[3], amplitude_v=0.5)  # it has 0.6 V
+    found = inspect(replace(clean, runs=tuple(runs)))
+    assert [(f.run, f.flag, f.severity) for f in found.flags] == [
+        (runs[3].name, "drive_amplitude", "excluded")
+    ]
+    assert "record again" in found.flags[0].detail
+    runs[5] = replace(runs[5], amplitude_v=0.9 * (runs[5].amplitude_v or 1.0))
+    both = inspect(replace(clean, runs=tuple(runs))).flags
+    assert [(f.flag, f.severity) for f in both] == [("drive_amplitude", "noted")] * 2
+
+
 def test_free_runs_that_are_none(clean: Campaign) -> None:
     """The generator left on; and a rig that does not oscillate."""
     on = one("drive", lambda x, t: x + np.sin(2 * np.pi * 168 * t))

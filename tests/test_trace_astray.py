@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import identify
 from identify import start, trace
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
@@ -27,9 +28,18 @@ from identify.trace.contests import (
 from identify.trace.scores import scan, stepped
 from identify.trace.stages import known_sizes
 from identify.trace.tried import tried
+from simulated_rig.campaigns import RecordedRun
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
-from tests.trace_material import campaign, fitted, only, record, thesis_campaign, tried_as
+from tests.trace_material import (
+    altered_campaign,
+    campaign,
+    fitted,
+    only,
+    record,
+    thesis_campaign,
+    tried_as,
+)
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -221,6 +231,24 @@ def test_what_the_fit_mostly_absorbs_starts_with_what_stands_for_it(tmp_path: Pa
     assert tried((form,), fit, ready.data).explains
     beside = np.r_[base.theta, form.to_internal((0.0776, 1 / (2 * np.pi * 45.53)))]
     assert fit_orbits(larger, ready.data, beside, iterations=0).chi2 > 100 * base.chi2
+
+
+def test_one_run_alone_is_no_evidence_of_a_cause(tmp_path: Path) -> None:
+    """One drive recorded too large by some per cent had been a scatter of all drives, by a fifth a
+    further mode and a drift: without that run the declared model explains everything."""
+
+    seen: list[str] = []
+
+    def larger(run: RecordedRun) -> RecordedRun:
+        seen.append(run.name)
+        return replace(run, drive=1.02 * run.drive) if len(seen) == 5 else run
+
+    ready = altered_campaign(tmp_path, 7, larger)
+    spoilt = ready.campaign.runs[4].name
+    found = identify.diagnose(ready.campaign, catalogue=[by_key("acoustic_mode:mode"), *SCATTERS])
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert f"Without run {spoilt} the declared model explains all others" in found.explanation
+    assert (spoilt, "contradicts_alone") in {(q.run, q.flag) for q in found.quality}
 
 
 @pytest.mark.slow

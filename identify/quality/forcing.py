@@ -11,6 +11,7 @@ from identify.results import QualityFlag
 WHOLE = 0.02  # periods by which a record may miss a whole number
 LOST_BINS = 1.5  # between the strongest bin and the frequency found: that is another line
 AMPLITUDE = 0.01  # relative difference from amplitude_v
+ODD = 0.1  # … and of one run alone, by which it is spoilt
 LEAK = 0.01  # of the forced runs' drive, in a free run
 OTHER_SCALE = 10.0
 
@@ -63,19 +64,34 @@ def amplitudes(views: Sequence[View]) -> list[QualityFlag]:
     if not asked:
         return []
     usual = float(np.median([r for _, r in asked]))
+    odd = _odd_one([r for _, r in asked], usual)
     out = []
     for v, ratio in asked:
-        if abs(ratio - 1) <= AMPLITUDE:
+        if abs(ratio - 1) <= AMPLITUDE and ratio != odd:
             continue
         alone = len(asked) > 2 and not 1 / OTHER_SCALE < ratio / usual < OTHER_SCALE
         detail = (
             f"the recorded drive is {ratio:.4g} times amplitude_v={v.run.amplitude_v:g}"
             f" (other runs: {usual:.4g}); "
-            + ("look for exchanged channels" if alone else "the recorded drive is used")
+            + (
+                "look for exchanged channels"
+                if alone
+                else "the recorded drive is used"
+                if ratio != odd
+                else "which of the two is wrong is not known: correct amplitude_v, or record again"
+            )
         )
         flag = "swapped_channels" if alone else "drive_amplitude"
-        out.append(finding(v.name, flag, "excluded" if alone else "noted", detail))
+        spoilt = alone or ratio == odd
+        out.append(finding(v.name, flag, "excluded" if spoilt else "noted", detail))
     return out
+
+
+def _odd_one(ratios: Sequence[float], usual: float) -> float | None:
+    """The one ratio that is far from all others, which agree."""
+    odd = [r for r in ratios if abs(r / usual - 1) > AMPLITUDE]
+    enough = len(ratios) > 3 and len(odd) == 1 and abs(odd[0] / usual - 1) > ODD
+    return odd[0] if enough else None
 
 
 def silence(views: Sequence[View]) -> list[QualityFlag]:

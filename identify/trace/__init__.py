@@ -21,8 +21,11 @@
    none of all these but a spread, or one law beside one, comes near, that is claimed though it
    looks a little less random, or leaves a little more, than most: with no law to hide, it is
    (`selection.unrivalled`).
+6. Before nothing, several effects, a spread or a law of many numbers is said, each run is left out:
+   where one alone contradicts the declared model, its recording is doubted (`lone`).
 """
 
+from identify.trace.lone import lone_run
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
 from identify.trace.selection import (
@@ -64,6 +67,7 @@ __all__ = [
     "deviating",
     "family_p",
     "foremost",
+    "lone_run",
     "other_forms",
     "outdone",
     "refitted",

@@ -291,7 +291,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
     if found.next_experiment:
         out.print(f"next experiment: {found.next_experiment['reason']}", markup=False)
         out.print("run it: --json FILE, then `entrain campaign run FILE`", markup=False)
-    elif found.verdict in ("ambiguous", "unexplained"):
+    elif found.verdict == "ambiguous" or found.whereabouts is not None:
         out.print("next experiment: none within the rig's reach tells the nearest apart")
 
 
