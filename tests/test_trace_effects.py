@@ -430,10 +430,10 @@ def test_a_mode_that_takes_little_part_is_found_by_its_tangents(tmp_path: Path) 
     effect = by_key("acoustic_mode")
     shapes = effect.shapes(known_sizes(ready.data, base))
     found = scan(ready.structure, ready.data, base, effect, shapes)
-    drop, _ = found[0]
+    drop, *_ = found[0]
     assert drop > 0.8 * (base.chi2 - base.dof)  # nearly all that noise does not explain
-    assert all(d <= drop for d, _ in found[1:])
-    frequencies = np.exp([row[0] for _, row in found])
+    assert all(d <= drop for d, *_ in found[1:])
+    frequencies = np.exp([row[0] for _, row, _ in found])
     assert np.ptp(frequencies[:4]) > 20  # not all neighbours of the best …
     assert np.abs(np.log(frequencies[:4] / 231.0)).min() < 0.06  # … and the truth among them
     best = only(ready, base, effect.key)
