@@ -157,9 +157,9 @@ def diagnose(
             asked += deviating()
             tried, asked = trace.unrivalled(tried, asked), trace.unrivalled(asked, tried)
             verdict, chosen, explanation = _judge(declared, tried, data, asked)
-    if verdict == "unexplained" and odd is None:
-        where = trace.whereabouts(asked, tried, base)
-        explanation = f"{explanation} {where.words}"
+        if verdict == "unexplained":
+            where = trace.whereabouts(asked, tried, base)
+            explanation = f"{explanation} {where.words}"
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."

@@ -255,6 +255,11 @@ class Candidate:
         return [f"{effect}:{form}" if twice and form else effect for effect, form in pairs]
 
     @property
+    def words(self) -> str:
+        """The effects as `equivalent_to` names them."""
+        return " + ".join(self.named)
+
+    @property
     def objection(self) -> str:
         """Why it does not explain the data; empty: it does."""
         if not self.adequate:

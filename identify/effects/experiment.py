@@ -132,7 +132,8 @@ class Warming(Effect):
         change = values.get(size, values.get("parameter_drift.relative_change", 0.0))
         if not other.form.startswith(("frequency", "several")):
             change = 0.0
-        return [(change, values.get(damping, 0.0), values.get(time, q)) for q in (0.3, 1.0)]
+        times = (values[time],) if time in values else (0.3, 1.0)
+        return [(change, values.get(damping, 0.0), q) for q in times]
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         size, damping, time = (p[q.name] for q in self.parameters)

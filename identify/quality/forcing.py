@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from identify.quality.findings import finding
+from identify.quality.findings import Severity, finding
 from identify.quality.view import View
 from identify.results import QualityFlag
 
@@ -69,21 +69,18 @@ def amplitudes(views: Sequence[View]) -> list[QualityFlag]:
     for v, ratio in asked:
         if abs(ratio - 1) <= AMPLITUDE and ratio != odd:
             continue
-        alone = len(asked) > 2 and not 1 / OTHER_SCALE < ratio / usual < OTHER_SCALE
+        severity: Severity = "noted"
+        flag, advice = "drive_amplitude", "the recorded drive is used"
+        if len(asked) > 2 and not 1 / OTHER_SCALE < ratio / usual < OTHER_SCALE:
+            flag, severity, advice = "swapped_channels", "excluded", "look for exchanged channels"
+        elif ratio == odd:
+            severity = "excluded"
+            advice = "which of the two is wrong is not known: correct amplitude_v, or record again"
         detail = (
             f"the recorded drive is {ratio:.4g} times amplitude_v={v.run.amplitude_v:g}"
-            f" (other runs: {usual:.4g}); "
-            + (
-                "look for exchanged channels"
-                if alone
-                else "the recorded drive is used"
-                if ratio != odd
-                else "which of the two is wrong is not known: correct amplitude_v, or record again"
-            )
+            f" (other runs: {usual:.4g}); {advice}"
         )
-        flag = "swapped_channels" if alone else "drive_amplitude"
-        spoilt = alone or ratio == odd
-        out.append(finding(v.name, flag, "excluded" if spoilt else "noted", detail))
+        out.append(finding(v.name, flag, severity, detail))
     return out
 
 

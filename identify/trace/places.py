@@ -184,7 +184,8 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
 def _several(tries: Sequence[Tried]) -> Tried | None:
     """The fewest effects of different places that leave nearly as little as any number of them."""
     laws = [t for t in tries if t.plausible and t.spread is None and t.fit.converged]
-    near = [t for t in laws if t.fit.chi2_per_dof < CLEARLY * min(o.fit.chi2_per_dof for o in laws)]
+    least = min((t.fit.chi2_per_dof for t in laws), default=np.inf)
+    near = [t for t in laws if t.fit.chi2_per_dof < CLEARLY * least]
     best = min(near, key=lambda t: (len(t.effects), misfit(t)), default=None)
     return best if best is not None and len({e.location for e in best.effects}) > 1 else None
 

@@ -265,7 +265,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
     )
     if found.candidates:
         best, claimed = found.candidates[0], found.verdict in ("traced", "ambiguous")
-        as_good = {" + ".join(best.named), *best.equivalent_to} if claimed else set()
+        as_good = {best.words, *best.equivalent_to} if claimed else set()
         other = "the first is likelier" if claimed else "not the cause by itself"
         table(
             "candidates, best first",
@@ -276,7 +276,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
                     "\n".join(c.locations),
                     number(c.chi2_per_dof),
                     number(c.validation_error, 3),
-                    c.objection or ("" if " + ".join(c.named) in as_good else other),
+                    c.objection or ("" if c.words in as_good else other),
                 )
                 for c in found.candidates[:8]
             ),
