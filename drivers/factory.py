@@ -25,7 +25,7 @@ from drivers.composed import ClosableInput, ComposedRig
 from drivers.errors import DriverError, SettingError
 from drivers.protocols import DuplexRig
 from drivers.stepped_output import SteppedOutput
-from drivers.types import Channel, OutputLimits
+from drivers.types import Channel, OutputLimits, require_si
 
 Options = Mapping[str, Any]
 T = TypeVar("T")
@@ -72,7 +72,7 @@ def open_device(driver: str, name: str, options: Options, *, isolate: bool = Fal
 
 def channels_of(rows: Any) -> tuple[Channel, ...]:
     """Channels from tables of their fields."""
-    return tuple(Channel(**row) for row in rows)
+    return tuple(require_si(Channel(**row)) for row in rows)
 
 
 def settings_of(kind: Callable[..., Any], name: str, options: Options) -> Any:

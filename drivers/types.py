@@ -17,6 +17,14 @@ Flag = Literal["overload", "clipped", "xrun", "gap", "repeated", "rate", "muted"
 FloatArray = npt.NDArray[np.float64]
 
 
+# Units of the same quantities that are not SI, and how many of the SI unit they are.
+NOT_SI: dict[str, dict[str, float]] = {
+    "Pa": {"µPa": 1e-6, "uPa": 1e-6, "mPa": 1e-3, "hPa": 1e2, "kPa": 1e3, "mbar": 1e2, "bar": 1e5},
+    "V": {"µV": 1e-6, "uV": 1e-6, "mV": 1e-3, "kV": 1e3},
+    "m/s": {"µm/s": 1e-6, "um/s": 1e-6, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6},
+}
+
+
 def require(condition: bool, parameter: str, value: object, requirement: str) -> None:
     """Raise `SettingError` naming parameter, value and requirement unless `condition` holds."""
     if not condition:
@@ -53,6 +61,24 @@ class Channel:
             self.full_scale_v,
             "a number of volts > 0",
         )
+
+
+def require_si(channel: Channel) -> Channel:
+    """The channel, if its unit is not a known multiple of the SI unit: values would be taken for
+    the SI unit's. Raises `SettingError` with what to give instead."""
+    for si, others in NOT_SI.items():
+        if channel.unit in others:
+            scale = channel.volts_per_unit / others[channel.unit]
+            raise SettingError(
+                f"channel {channel.name!r}: unit={channel.unit!r} is not SI; "
+                f"give unit {si!r} and volts_per_unit={scale:.9g}"
+            )
+    if channel.unit.lower().startswith("db"):
+        raise SettingError(
+            f"channel {channel.name!r}: unit={channel.unit!r} is no unit of samples; "
+            "give the recording's volts and volts_per_unit"
+        )
+    return channel
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,7 @@ def structure_of(content: Mapping[str, Any]) -> Structure:
         flame_order=_integer("flame.order", flame.get("order", 1), 0),
         flame_delay=_boolean("flame.delay", flame.get("delay", False)),
         nonlinearity=form,
-        degree=_integer("nonlinearity.degree", shape.get("degree", 3), 2),
+        degree=_integer("nonlinearity.degree", shape.get("degree", 3), 1),
         nodes=_nodes(shape.get("nodes", [])) if form == "lagrange" else (),
         effects=elements,
     )

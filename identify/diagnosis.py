@@ -324,8 +324,9 @@ def _judge(
         return "no_discrepancy", None, _not_contradicted(declared.fit)
     good = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
     good = [t for t in good if not trace.outdone(t, pieces)]
-    if good:
-        best = trace.best_form(good)
+    ended = [t for t in good if t.fit.converged]  # only what has values is claimed
+    if ended:
+        best = trace.best_form(ended)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
         implausible = [t for t in tried if t.spread is None and t.adequate and not t.plausible]
         others = trace.rivals(best, [*good, *spreads, *implausible])
@@ -364,7 +365,10 @@ def _judge(
         "it is reported, not claimed."
     )  # fmt: skip
     near_it = [t for t in tried if t.explains]
-    if any(trace.outdone(t, pieces) for t in near_it):
+    if good:
+        nearest = trace.best_form(good)
+        said = f"{nearest.words} comes near to the data, with no values: {nearest.fit.reason}."
+    elif any(trace.outdone(t, pieces) for t in near_it):
         said = "What comes near to the data is far less likely than a law that nobody here knows."
     elif near_it:
         said = "What comes near to the data takes too little of the misfit away to be its cause."

@@ -71,9 +71,7 @@ class Polynomials:
 
 def _degree(structure: Structure) -> int:
     """Highest power of w that stands for the nonlinearity while starting."""
-    if structure.nonlinearity == "polynomial":
-        return min(structure.degree, 5)
-    return 1 if structure.nonlinearity == "linear" else 3
+    return min(structure.highest_power, 5)
 
 
 @dataclass(frozen=True)

@@ -213,6 +213,10 @@ class Effect:
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
 
+    def extends(self, structure: "Structure") -> bool:
+        """Whether it says what this declared model does not say already."""
+        return self.mode_count in (None, structure.mode_count)
+
     def starts(self, known: "Known") -> list[tuple[float, ...]]:
         raise NotImplementedError(f"effect {self.name!r} proposes no starting values")
 
@@ -362,10 +366,17 @@ class Structure:
             raise ValueError(f"flame_order={self.flame_order} is not an integer >= 0")
         if self.nonlinearity not in NONLINEARITIES:
             raise ValueError(f"nonlinearity={self.nonlinearity!r} is not one of {NONLINEARITIES}")
-        if self.nonlinearity == "polynomial" and self.degree < 2:
-            raise ValueError(f"nonlinearity_degree={self.degree} is not an integer >= 2")
+        if self.nonlinearity == "polynomial" and self.degree < 1:
+            raise ValueError(f"nonlinearity_degree={self.degree} is not an integer >= 1")
         if self.nonlinearity == "lagrange" and len(self.nodes) < 2:
             raise ValueError(f"nodes={self.nodes} are not at least two values other than zero")
+
+    @property
+    def highest_power(self) -> int:
+        """The highest power of the flame's input that the characteristic has, or, if it is no
+        polynomial, that stands for it."""
+        powers = {"polynomial": self.degree, "linear": 1, "lagrange": len(self.nodes) + 1}
+        return powers.get(self.nonlinearity, 3)
 
     @property
     def base_parameters(self) -> tuple[Parameter, ...]:

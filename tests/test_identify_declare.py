@@ -76,7 +76,7 @@ def test_what_is_wrong_is_named_with_the_file(text: str, words: list[str], tmp_p
     [
         (DeclaredModel(flame="n_tau"), r"declared_model.flame='n_tau' is not one of \['first_"),
         (DeclaredModel(nonlinearity="cubic"), "declared_model.nonlinearity='cubic' is not one of"),
-        (DeclaredModel(nonlinearity_degree=1), "declared_model.nonlinearity_degree=1 is not an"),
+        (DeclaredModel(nonlinearity_degree=0), "declared_model.nonlinearity_degree=0 is not an"),
         (DeclaredModel(modes=0), "declared_model.modes=0 is not an integer >= 1"),
     ],
 )

@@ -148,6 +148,11 @@ BAD = {
     "no frequency": (_edit("frequency_hz = 166.0\n", ""), "f166.*needs frequency_hz"),
     "above nyquist": (_edit("166.0", "1166.0"), "frequency_hz=1166"),
     "zero sensitivity": (_edit("= 0.002", "= 0.0"), "'p1'.*volts_per_unit=0"),
+    "millipascal": (
+        _edit('"Pa"', '"mPa"'),
+        r"'p1': unit='mPa' is not SI; give unit 'Pa' and volts_per_unit=2$",
+    ),
+    "decibels": (_edit('"Pa"', '"dB"'), "'p1': unit='dB' is no unit of samples"),
     "twice p1": (_edit('"p2"', '"p1"'), "named twice: p1"),
     "unknown kind": (_edit('"free"', '"warm"'), r"runs\[0\]\.kind='warm'"),
     "unknown suffix": (

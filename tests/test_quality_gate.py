@@ -144,6 +144,20 @@ def test_dead_channels_exclude(clean: Campaign, channel: str) -> None:
     assert flags == {"dead_channel": "excluded"}
 
 
+@pytest.mark.parametrize("channel", ["p1", "p2"])
+@pytest.mark.parametrize("share", [1e-3, 0.03])
+def test_a_channel_of_noise_alone_is_dead(clean: Campaign, channel: str, share: float) -> None:
+    """An open input shows its offset and noise."""
+
+    def open_input(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        noise = np.random.default_rng(3).standard_normal(x.size)
+        return np.asarray(0.2 + share * float(np.std(x)) * noise)
+
+    found, flags, _ = judged(clean, one(channel, open_input))
+    assert flags["dead_channel"] == "excluded"
+    assert any(f.flag == "dead_channel" and channel in f.detail for f in found.flags)
+
+
 def test_missing_and_broken_channels_exclude(clean: Campaign) -> None:
     def wreck(x: np.ndarray, t: np.ndarray) -> np.ndarray:
         x[17] = np.nan

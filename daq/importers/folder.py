@@ -18,7 +18,8 @@ from daq.importers.checks import SampleCheck
 from daq.importers.recording import Recording, read_recording
 from daq.records import CampaignCard, Kind, Role, RunHeader, RunSummary
 from daq.store import RunStore, slug, utc_now
-from drivers.types import Channel, Quantity
+from drivers.errors import SettingError
+from drivers.types import Channel, Quantity, require_si
 
 FORMAT = "campaign-folder/1"
 SLICE_FRAMES = 1 << 18
@@ -60,15 +61,18 @@ class ChannelTable(Strict):
     serial_number: str | None = None
 
     def channel(self) -> Channel:
-        """As the store keeps it; raises `SettingError` for what `Channel` refuses."""
-        return Channel(
-            self.name,
-            self.quantity,
-            self.unit,
-            self.volts_per_unit,
-            self.full_scale_v,
-            self.position_m,
-            self.serial_number,
+        """As the store keeps it; raises `SettingError` for what `Channel` refuses, and for a unit
+        that is not SI."""
+        return require_si(
+            Channel(
+                self.name,
+                self.quantity,
+                self.unit,
+                self.volts_per_unit,
+                self.full_scale_v,
+                self.position_m,
+                self.serial_number,
+            )
         )
 
 
@@ -169,8 +173,10 @@ def _require_consistent(path: Path, description: CampaignToml) -> None:
     if double:
         raise InputError(f"{path}: channels named twice: {', '.join(sorted(double))}")
     for channel in description.channels:
-        if channel.volts_per_unit == 0:
-            raise InputError(f"{path}: channel {channel.name!r}: volts_per_unit=0 is not a scale")
+        try:
+            channel.channel()
+        except SettingError as error:
+            raise InputError(f"{path}: {error}") from error
     stems = [Path(run.file).stem for run in description.runs]
     forced = 0
     for index, run in enumerate(description.runs):

@@ -9,7 +9,7 @@ import numpy as np
 from daq.errors import InputError
 from daq.importers import RecordingOptions, read_recording
 from daq.records import Kind
-from drivers.types import Channel, Quantity
+from drivers.types import Channel, Quantity, require_si
 from identify.characterise import Recording, RecordingError, read_text
 
 TEXT = frozenset({".csv", ".txt", ".tsv", ".dat", ""})
@@ -72,6 +72,8 @@ def parse_channel(text: str) -> Channel:
         )
     try:
         position = float(parts[4]) if len(parts) == 5 else None
-        return Channel(parts[0], parts[1], parts[2], float(parts[3]), position_m=position)  # type: ignore[arg-type]
+        return require_si(
+            Channel(parts[0], parts[1], parts[2], float(parts[3]), position_m=position)  # type: ignore[arg-type]
+        )
     except ValueError as error:
         raise InputError(f"channel={text!r}: {error}") from error

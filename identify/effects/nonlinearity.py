@@ -1,5 +1,7 @@
 """Nonlinearity: another characteristic than the declared one."""
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -16,29 +18,52 @@ from identify.structure import (
     Known,
     Operator,
     Passed,
+    Structure,
     Values,
 )
 
 Samples = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
+CUBIC = 3  # the lowest power that bounds a limit cycle
+POWERS = {2: "quadratic", 3: "cubic", 4: "quartic", 5: "quintic", 6: "sextic", 7: "septic"}
+
 
 class HigherOrder(Effect):
-    """Further powers of the flame's input, added to the declared polynomial."""
+    """Further powers of the flame's input, the next or the next but one, added to the declared
+    polynomial."""
 
     name, location = "nonlinearity_shape", "nonlinearity"
 
     def __init__(self, powers: tuple[int, ...]) -> None:
         self.powers = powers
-        words = {4: "quartic", 5: "quintic", 6: "sextic", 7: "septic"}
-        self.form = "_".join(words[d] for d in powers)
+        self.form = "_".join(POWERS.get(d, f"power_{d}") for d in powers)
         self.parameters = tuple(
             Parameter(f"nonlinearity_shape.c{d}", f"m^-{d - 1}") for d in powers
         )
 
+    def extends(self, structure: Structure) -> bool:
+        return 0 < min(self.powers) - structure.highest_power <= 2
+
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         w = known.flame_input_amplitude
         return [tuple(-0.02 / w ** (d - 1) for d in self.powers)]
+
+    def restated(self, structure: Structure) -> Structure | None:
+        """What lacks the cubic term has no limit cycle, so that its own fit is no place to start
+        from; what has it, is."""
+        if max(self.powers) != CUBIC or structure.highest_power >= CUBIC:
+            return None
+        return replace(structure, nonlinearity="polynomial", degree=CUBIC)
+
+    def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
+        known = [values[q.name] for q in structure.base_parameters]
+        return [*known, *(values[f"nonlinearity.c{d}"] for d in self.powers)]
+
+    def to_restated(self, structure: Structure, values: Mapping[str, float]) -> dict[str, float]:
+        known = {q.name: values[q.name] for q in structure.base_parameters}
+        own = {f"nonlinearity.c{d}": values[f"nonlinearity_shape.c{d}"] for d in self.powers}
+        return {**known, **own}
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.powers)
@@ -227,9 +252,8 @@ def _contacts(x: Samples, half: Samples) -> tuple[Indices, Samples]:
 
 
 EFFECTS: tuple[Effect, ...] = (
-    HigherOrder((4,)),
-    HigherOrder((5,)),
-    HigherOrder((4, 5)),
+    *(HigherOrder((d,)) for d in POWERS),
+    *(HigherOrder((d, d + 1)) for d in (2, 4, 6)),
     Saturation("tanh"),
     Saturation("algebraic"),
     Saturation("arctan"),

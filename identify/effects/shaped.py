@@ -24,6 +24,7 @@ from identify.effects.scatter import Change, DriveGain, DrivePhase, Scatter, Sen
 from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
 from identify.structure import (
+    Characteristic,
     Conditions,
     Effect,
     Known,
@@ -42,8 +43,7 @@ MODE = AcousticMode()
 LOSS = NonlinearDamping("quadratic_cubic")
 DISTORTION = Distortion((2, 3))
 CUT_OFF = Distortion((2, 3, 5, 7))  # at both ends
-POWERS = HigherOrder((4, 5, 6, 7))
-LOWEST, HIGHEST = min(POWERS.powers), max(POWERS.powers)
+MORE_POWERS = 4  # of the flame's input, than declared
 WANDERING = ("frequency", "damping", "flame", "speaker")
 LAGS = (0.2, 0.8)  # times of the lags to start from, in 1/ω₀
 
@@ -57,13 +57,14 @@ def lag(time: float) -> tuple[float, ...]:
 @dataclass(frozen=True)
 class Setting:
     """What the pieces of a campaign are made for: the free frequency, how many modes are declared,
-    the velocity (m/s) that the fundamental usually has in forced runs, and whether a pressure is
-    known beside it."""
+    the velocity (m/s) that the fundamental usually has in forced runs, whether a pressure is known
+    beside it, and the highest power of the flame's input that is declared."""
 
     free_hz: float
     modes: int
     velocity: float = 1.0
     pressure: bool = True
+    highest_power: int = 3
 
 
 class Shaped(Effect):
@@ -233,18 +234,27 @@ class ShapedForward(Shaped):
 
 
 class ShapedNonlinearity(Shaped):
-    """Powers four to seven of the flame's input."""
+    """The next powers of the flame's input, four to seven where three are declared."""
 
-    location, linear, besides = "nonlinearity", False, POWERS.parameters
-    characteristic = POWERS.characteristic
+    location, linear = "nonlinearity", False
+
+    def __init__(self, setting: Setting) -> None:
+        first = setting.highest_power + 1
+        self.powers = HigherOrder(tuple(range(first, first + MORE_POWERS)))
+        self.besides = self.powers.parameters
+        super().__init__(setting)
+
+    def characteristic(self, p: Values, n: Characteristic, at: Conditions) -> Characteristic:
+        return self.powers.characteristic(p, n, at)
 
     def restated(self, structure: Structure) -> Structure | None:
-        declared = structure.nonlinearity == "polynomial" and structure.degree == LOWEST - 1
-        return replace(structure, degree=HIGHEST) if declared else None
+        if structure.nonlinearity not in ("polynomial", "linear"):
+            return None
+        highest = max(self.powers.powers)
+        return replace(structure, nonlinearity="polynomial", degree=highest)
 
     def from_restated(self, structure: Structure, values: Mapping[str, float]) -> list[float]:
-        known = [values[q.name] for q in structure.base_parameters]
-        return [*known, *(values[f"nonlinearity.c{d}"] for d in POWERS.powers)]
+        return self.powers.from_restated(structure, values)
 
 
 class ShapedMemory(Shaped):

@@ -18,7 +18,7 @@ PLATEAU = 3  # samples in a row that a flat top must have
 CODES = 10  # values below the largest to compare its count with,
 PILE, PILE_RATIO = 20, 8.0  # which it exceeds by this factor when they were cut
 SIGNIFICANT_SHARE = 5e-3  # of the samples clipped, beyond which a run is excluded
-DEAD_RATIO = 1e-3  # of the other channel's size
+DEAD_RATIO = 1e-3  # of the size of the other channel's harmonics
 
 
 def broken(run: Run) -> list[QualityFlag]:
@@ -73,15 +73,18 @@ def broken(run: Run) -> list[QualityFlag]:
 
 
 def weak(view: View) -> list[QualityFlag]:
-    """A channel far smaller than its neighbour a few centimetres away."""
+    """A channel that has hardly any of its neighbour's harmonics a few centimetres away."""
     if len(view.inputs) < 2 or not view.level.max() > 0:
         return []
-    rms = np.array([np.std(view.values[n]) for n in view.inputs])
-    ratio = float(rms.min() / rms.max())
+    sizes = np.linalg.norm(view.coefficients[: len(view.inputs)], axis=1)
+    ratio = float(sizes.min() / sizes.max())
     if ratio > DEAD_RATIO:
         return []
-    name = view.inputs[int(np.argmin(rms))]
-    detail = f"{name}: {ratio:.1e} of the other pressure channel; check its cable and supply"
+    name = view.inputs[int(np.argmin(sizes))]
+    detail = (
+        f"{name}: its harmonics are {ratio:.1e} of the other pressure channel's; "
+        "check its cable and supply"
+    )
     return [finding(view.name, "dead_channel", "excluded", detail)]
 
 

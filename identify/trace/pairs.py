@@ -34,6 +34,8 @@ STANDING = {
     "flame_dynamics:pole",
     "flame_dynamics:second_time_scale",
     "flame_dynamics:second_order",
+    "nonlinearity_shape:quadratic_cubic",
+    "nonlinearity_shape:cubic",
     "nonlinearity_shape:quartic_quintic",
     "nonlinearity_shape:tanh",
     "nonlinearity_shape:quadratic_odd",

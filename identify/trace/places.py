@@ -78,6 +78,7 @@ def shaped(
         structure.mode_count,
         known_sizes(data, base).velocity_amplitude,
         knows_pressure(data),
+        structure.highest_power,
     )
     every = (piece(setting) for piece in shapes)
     differing = first_of_each(every, lambda p: p.parameters)  # of one mode two are the same

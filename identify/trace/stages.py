@@ -527,7 +527,7 @@ def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
     """Whether the effect can be added to this declared model and asked of these data."""
     if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
         return False
-    if effect.mode_count not in (None, structure.mode_count):
+    if not effect.extends(structure):
         return False
     if "flame_pole" in effect.needs and structure.flame_order == 0:
         return False

@@ -35,6 +35,7 @@ LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws le
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
+LOST = 1e6  # times its value: a standard error that says nothing of it
 WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
 ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
@@ -168,8 +169,10 @@ class Tried:
         unseen = (n for n in located if not known[n].stderr <= abs(values[n]))
         dampings = (f"mode{i}.damping" for i in range(1, self.fit.structure.mode_count + 1))
         overdamped = (n for n in dampings if not values[n] < MODAL)
+        lost = (n for n in open_ if LOST * values[n] < known[n].stderr < np.inf)
         for names, what in (
             (outside, "at the edge of its range"),
+            (lost, "not known by any order of magnitude"),
             (unseen, "within its own error of nothing"),
             (overdamped, "no mode's"),
         ):
