@@ -58,6 +58,7 @@ REFINED = 1500  # iterations of a form that refines another: a long valley may l
 NEAREST = 2  # … from so many starts at most
 LED_ON = 4  # of the best of a level that had not converged …
 FARTHEST = 300  # … by so many iterations more
+NEEDLESS = 100.0  # of χ²: what leaving an effect out adds at most, if it is to be left out
 REFORMED = 3  # sets of effects of which other forms are tried: the best one, and others …
 NEAR = 100.0  # … that leave no more than so much χ²/dof …
 BEHIND = 3.0  # … and, where forms of a better one explain the data, than so many times its χ²
@@ -80,7 +81,9 @@ def part_of(
 
 
 def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
-    """The fit with only some of the effects of `t`, started from its values."""
+    """The fit with only some of the effects of `t`, started from its values: led in, and straight
+    where that ends no nearer. What an effect that stands for nothing leaves is at its minimum
+    already, which coarser noise may lead away from."""
     smaller = replace(t.fit.structure, effects=effects)
     names = smaller.parameters.names
     known = [t.fit.values]
@@ -89,7 +92,12 @@ def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
             known += _named_otherwise(e, t)
             known += [p for p in (_merged(e, t, q) for q in known) if p is not None]
     thetas = np.stack([smaller.parameters.to_internal([p[n] for n in names]) for p in known])
-    return fit_orbits(smaller, data, thetas, continuation=(0.003, 0.0))
+    led = fit_orbits(smaller, data, thetas, continuation=(0.003, 0.0))
+    if led.chi2 < t.fit.chi2 + NEEDLESS:
+        return led
+    enough = (t.fit.chi2 + NEEDLESS) / data.residuals
+    straight = fit_orbits(smaller, data, thetas[0], continuation=(0.0,), hopeless=enough)
+    return min(led, straight, key=lambda f: f.chi2)
 
 
 def _named_otherwise(effect: Effect, t: Tried) -> list[dict[str, float]]:
