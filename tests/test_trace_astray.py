@@ -8,7 +8,7 @@ import pytest
 
 import identify
 from identify import start, trace
-from identify.effects import CATALOGUE, by_key
+from identify.effects import CANDIDATES, CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
@@ -18,6 +18,7 @@ from identify.parameters import ParameterSet
 from identify.scatter import fit_scatter
 from identify.structure import Mode
 from identify.trace.contests import (
+    at_the_same_place,
     in_each_form,
     in_other_forms,
     in_their_places,
@@ -37,6 +38,7 @@ from tests.trace_material import (
     fitted,
     only,
     record,
+    recorded,
     thesis_campaign,
     tried_as,
 )
@@ -364,3 +366,17 @@ def test_a_resonator_takes_energy_from_every_mode() -> None:
         p = ParameterSet(branch.parameters).plain(theta)
         load = branch.branch(p, modes, 2j * np.pi * 170.0)
         assert all(f * r >= 0 for f, r in zip(load.felt, load.returned, strict=True))
+
+
+def test_a_lag_of_the_sound_is_one_of_the_record(tmp_path: Path) -> None:
+    """A speaker's pole at 5 kHz: once the sensors' low-pass stands for it, the pole is tried from
+    its values, which no start of its own had led to (effects 33032: «traced» sensor_dynamics)."""
+    ready, base = recorded(
+        tmp_path, 3, "actuator_dynamics/voice_coil", noise_db=30.0, pole_hz=5000.0
+    )
+    lowpass = only(ready, base, "sensor_dynamics:lowpass")
+    assert lowpass.explains
+    found = at_the_same_place([lowpass], ready.data, CANDIDATES, InProcess())
+    by = {t.effects[0].key: t for t in found}
+    assert by["actuator_dynamics:pole"].explains
+    assert trace.rivals(lowpass, list(by.values()))

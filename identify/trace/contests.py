@@ -53,6 +53,11 @@ SETTLED = 16  # of the nearest of them are led on
 RUNNERS_UP = 2  # sets whose other forms are tried for that
 #: Places whose effects are responses that others may be like, and what else is moved for that.
 MOVING = {"flame": "flame.", "actuator": "flame.", "forward": "mode"}
+#: Lags at one end of the way from the drive to the record, and at the other.
+OTHER_END = {
+    "actuator_dynamics": "sensor_dynamics",
+    "sensor_dynamics": "actuator_dynamics",
+}
 NEARBY = 0.7  # of the logarithm, where another form is matched
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between …
 NEAREST = 2  # … from so many starts at most
@@ -425,7 +430,8 @@ def runners_up(
 def at_the_same_place(
     tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
 ) -> list[Tried]:
-    """Other effects at the location of each that explains the data, from where it ended.
+    """Other effects at the location of each that explains the data, from where it ended; of those
+    at the other end of the way from the drive to the record, those that its values start.
 
     They are the likeliest to predict the same, and may have lost their way on coarse noise.
     """
@@ -439,12 +445,20 @@ def at_the_same_place(
         for old in best.effects
         for kept in [tuple(o for o in best.effects if o is not old)]
         for e in available
-        if e.location == old.location
+        if _may_stand_for(e, old, best)
         and e.name not in best.names
         and not e.refines
         and key_of_forms((*kept, e)) not in done
     ]
     return _refitted(items, data, run)
+
+
+def _may_stand_for(e: Effect, old: Effect, t: Tried) -> bool:
+    """Whether `e` may predict what `old`, one of the effects of `t`, does. A lag of the sound is
+    one of the record: what oscillates freely has no phase to tell them by."""
+    if e.location == old.location:
+        return True
+    return OTHER_END.get(old.name) == e.name and bool(e.starts_from(old, t.fit.values))
 
 
 def in_their_places(

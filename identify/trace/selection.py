@@ -158,6 +158,7 @@ class _Searching:
     tried: list[Tried] = field(default_factory=list)
     extended: dict[tuple[str, ...], float] = field(default_factory=dict)  # grown from, χ² there …
     done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
+    found: set[tuple[str, ...]] = field(default_factory=set)  # alone, beside all other effects
 
     @property
     def apart(self) -> list[Effect]:
@@ -202,10 +203,17 @@ class _Searching:
             _Alone(self.structure, self.data, base, self.available, scores), self.run, self.report
         )
         self.tried += singles
+        self.found |= {t.key_of_forms for t in singles if t.explains}
         if base.chi2_per_dof < LITTLE or not self.explained:
             self.report(0.6, "trying run-to-run scatter")
             self.tried += self._scattered(self.structure, base)
         return singles
+
+    def _left_alone(self) -> list[Tried]:
+        """The effects that explain the data alone and were not found so: what they stood beside was
+        not needed, or they were the only candidate. Nothing has contested them yet."""
+        singles = [t for t in self.laws if len(t.effects) == 1 and t.explains]
+        return singles if singles and best_form(singles).key_of_forms not in self.found else []
 
     def each_alone(self, scores: Mapping[str, ScoreTest] | None) -> None:
         """Each effect as if it were the only candidate, where nothing explains the data: of all
@@ -403,6 +411,7 @@ class _Searching:
         if any(t.explains for t in several):
             self.tried += in_other_forms(several, data, self.forms, run)
         near = at_the_same_place(several, data, self.available, run)
+        near += at_the_same_place(self._left_alone(), data, self.available, run)
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
