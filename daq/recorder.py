@@ -72,8 +72,7 @@ class Recorder:
             name, number = f"{stem}-{number}", number + 1
         said = rig.run_notes() if isinstance(rig, SelfDescribing) else {}
         channels, skews, remarks = self.calibration
-        if remarks:
-            said = {**said, "calibration": remarks}
+        said = {**said, "calibration": remarks}
         return RunHeader(
             name=name,
             kind=item.kind,

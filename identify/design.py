@@ -255,6 +255,8 @@ def tell_apart(
             options = exchanged(options)
         free = reach.free(record_s)
         runs = possible((free, *options), ready, fits, misfit)
+        if not runs.options:  # no run that they all have an answer for
+            continue
         aim = Discrimination(fits, runs)
         first = [i for i, o in enumerate(runs.options) if o.kind == "free"]
         picked, gains = choose(aim, runs.options, reach.cost.seconds, first=first)
@@ -287,6 +289,8 @@ def sharpen(
     free = reach.free(length)
     wanted = dict.fromkeys((free, *before.options, *reach.options(length)))
     able = possible(tuple(wanted), ready, [fit])
+    if not able.options:
+        return before
     aim = Precision(fit, able)
     taken = (free, *before.options)
     first = [i for i, o in enumerate(able.options) if o in taken]
@@ -303,8 +307,11 @@ def sharpen(
 
 def expected_estimates(fit: Fit, ready: Prepared, chosen: Chosen) -> dict[str, Estimate]:
     """The parameters with the standard errors that the chosen runs are expected to leave."""
-    new = possible(chosen.options, ready, [fit]).seen_by(fit.structure, fit.theta).jacobian
-    stacked = np.concatenate([fit.jacobian, new.reshape(-1, fit.theta.size)])
+    runs = possible(chosen.options, ready, [fit]) if chosen.options else None
+    stacked = fit.jacobian
+    if runs is not None and runs.options:
+        new = runs.seen_by(fit.structure, fit.theta).jacobian
+        stacked = np.concatenate([stacked, new.reshape(-1, fit.theta.size)])
     return fit.structure.parameters.estimates(fit.theta, covariance_of(stacked))
 
 

@@ -167,6 +167,8 @@ def diagnose(
     before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
     effects = (*_traced(chosen, tried), *tones) if claimed and chosen else tuple(tones)
+    report(0.99, "choosing the next experiment")
+    next_experiment = _next(ready, verdict, tried, chosen)
     report(1.0, "done")
     return Diagnosis(
         campaign=campaign.identifier or campaign.title,
@@ -178,7 +180,7 @@ def diagnose(
         verdict=verdict,
         effects=effects,
         after=after,
-        next_experiment=_next(ready, verdict, tried, chosen),
+        next_experiment=next_experiment,
         seconds=time.perf_counter() - began,
         explanation=explanation,
         whereabouts=where,

@@ -90,7 +90,8 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
             f"campaign {campaign.title!r} has no usable forced run to fit on"
             + (f"; excluded are {'; '.join(why)}" if why else "; record at least one")
         )
-    mics = harmonics.microphones(campaign.runs[0])
+    usable = next(r for r in campaign.runs if r.name == measured[0].name)
+    mics = harmonics.microphones(usable)
     data = dataset.build(measured, campaign.medium, mics)
     return Prepared(campaign, chosen, found, tuple(measured), data)
 
@@ -153,6 +154,9 @@ def fit_structure(structure: Structure, data: Dataset) -> Fit:
     return fit
 
 
+NOT_AT_ALL = 10.0  # standard deviations of a logarithm beyond which no factor is named
+
+
 def undetermined(fit: Fit, data: Dataset, limit: float = 1.0) -> tuple[str, ...]:
     """Combinations of parameters that the data do not determine, as readable text.
 
@@ -171,11 +175,15 @@ def undetermined(fit: Fit, data: Dataset, limit: float = 1.0) -> tuple[str, ...]
         deviation = 1.0 / max(float(s), 1e-12)
         if deviation <= limit:
             continue
-        order = [int(i) for i in np.argsort(-np.abs(v)) if abs(v[i]) > 0.2][:4]
-        first = v[order[0]]
-        parts = [f"{names[order[0]]}"]
-        parts += [f"{v[i] / first:+.2g} of {names[i]}".replace("-", "−") for i in order[1:]]
-        how = "not at all" if deviation > 1e6 else f"to a factor of {np.exp(deviation):.2g}"
+        first, *others = (int(i) for i in np.argsort(-np.abs(v))[:4])
+        parts = [names[first]]
+        parts += [
+            f"{v[i] / v[first]:+.2g} of {names[i]}".replace("-", "−")
+            for i in others
+            if abs(v[i]) > 0.2
+        ]
+        lost = deviation > NOT_AT_ALL
+        how = "not at all" if lost else f"to a factor of {np.exp(deviation):.2g}"
         out.append(f"{' with '.join([parts[0], ', '.join(parts[1:])]) if parts[1:] else parts[0]}"
                    f" ({how})")  # fmt: skip
     return tuple(out)

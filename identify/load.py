@@ -98,10 +98,16 @@ def load_run(path: Path | str) -> Run:
                 for name, detector in file["entry/instrument"].items()
             }
             gaps = file["entry/quality/gaps"][()]
+            return _run(entry, rate, signals, gaps)
     except LoadError:
         raise
     except (OSError, KeyError, ValueError, RuntimeError) as error:
-        raise LoadError(f"{path}: not a readable run file ({error})") from error
+        raise LoadError(
+            f"{path}: not a readable run file ({error}); record or import the run again"
+        ) from error
+
+
+def _run(entry: dict[str, Any], rate: float, signals: dict[str, Signal], gaps: Any) -> Run:
     notes = json.loads(str(entry["notes"]))
     if len(gaps):
         notes["gaps"] = gaps.tolist()

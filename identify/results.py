@@ -236,7 +236,7 @@ class Candidate:
     chi2: float
     chi2_per_dof: float
     validation_error: float
-    p_value: float  # of the gain in χ² over the next smaller model, corrected for the search
+    p_value: float  # of the gain in χ² over the declared model, corrected for the search
     parameters: Mapping[str, Estimate]
     equivalent_to: tuple[str, ...] = ()
     plausible: bool = True

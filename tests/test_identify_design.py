@@ -13,7 +13,7 @@ from daq.plan import parse_plan
 from identify import balance, dataset, design
 from identify.effects import by_key
 from identify.fit import Fit, fit_orbits
-from identify.foresee import Past, possible
+from identify.foresee import Past, Possible, possible
 from identify.harmonics import Harmonics, Microphones
 from identify.identification import Prepared
 from identify.quality import Quality
@@ -188,3 +188,19 @@ def test_the_proposal_is_a_plan_that_campaigns_take() -> None:
     assert RIVAL in told["reason"]
     # alone, an explanation needs nothing to be told from
     assert design.next_experiment(pair[:1], ready, "ambiguous") is None
+
+
+def test_rivals_that_no_run_is_seen_by_have_no_next_experiment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Where no run within reach has an answer from every rival, the diagnosis had ended in an
+    error after all its work."""
+    pair, ready = rivals()
+    fit = pair[0].fit
+    monkeypatch.setattr(design, "possible", lambda *args, **kwargs: Possible((), ()))
+    assert design.next_experiment(pair, ready, "ambiguous") is None
+    reach = reach_of(ready.campaign, ready.measured, ready.data.free_hz, ready.quality.excluded)
+    assert design.sharpen(fit, ready, reach) == design.Chosen()
+    alone = design.expected_estimates(fit, ready, design.Chosen())
+    for name, estimate in alone.items():
+        assert estimate.stderr == pytest.approx(fit.estimates[name].stderr, rel=1e-3)

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from identify.identification import prepare
 from identify.quality import Quality, inspect
-from identify.record import Campaign, Medium, Signal
+from identify.record import Campaign, Medium, Run, Signal
 from tests.quality_material import (
     FREE_HZ,
     FREE_PA,
+    RATE,
     Edit,
     campaign_of,
     clip,
@@ -156,6 +158,32 @@ def test_a_channel_of_noise_alone_is_dead(clean: Campaign, channel: str, share: 
     found, flags, _ = judged(clean, one(channel, open_input))
     assert flags["dead_channel"] == "excluded"
     assert any(f.flag == "dead_channel" and channel in f.detail for f in found.flags)
+
+
+def test_a_first_run_that_is_excluded_ends_nothing(clean: Campaign) -> None:
+    """The microphones had been those of the first run, usable or not."""
+    first = clean.runs[0]
+    alone = {n: s for n, s in first.signals.items() if n != "p2"}
+    spoilt = replace(clean, runs=(replace(first, signals=alone), *clean.runs[1:]))
+    ready = prepare(spoilt)
+    assert ready.quality.excluded == {first.name}
+    assert len(ready.measured) == len(clean.runs) - 1
+
+
+def test_runs_of_unlike_rates_are_compared_as_far_as_they_go(clean: Campaign) -> None:
+    """A free line above half the rate of all forced runs had raised an error."""
+
+    def slower(run: Run) -> Run:
+        signals = {n: replace(s, values=s.values[::10]) for n, s in run.signals.items()}
+        return replace(run, signals=signals, sample_rate_hz=RATE / 10)
+
+    t = np.arange(clean.runs[0].samples) / RATE
+    high = {
+        n: replace(s, values=np.asarray(0.05 * np.sin(2 * np.pi * 1700.0 * t) + 0 * s.values))
+        for n, s in clean.runs[0].signals.items()
+    }
+    runs = (replace(clean.runs[0], signals=high), *map(slower, clean.runs[1:]))
+    assert inspect(replace(clean, runs=runs)) is not None
 
 
 def test_missing_and_broken_channels_exclude(clean: Campaign) -> None:

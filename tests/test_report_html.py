@@ -15,7 +15,7 @@ from identify.report.compared import harmonics_figure
 from identify.report.misfit import heat_map, in_noise_units
 from identify.report.theme import INK, power_of_ten, to_svg
 from identify.report.words import percent, scientific, with_error
-from identify.results import Diagnosis, Identification
+from identify.results import Diagnosis, Identification, QualityFlag, TracedEffect
 from tests import report_material as material
 
 VOID = {"meta", "br", "hr", "img", "link", "input"}
@@ -141,8 +141,12 @@ def test_leaves_out_what_it_was_not_given() -> None:
 def test_says_what_is_missing_or_stale_of_the_calibration() -> None:
     result, campaign = material.diagnosis(), material.recorded()
     assert (
-        "every pressure channel had one in force"
-        in read(html(result, campaign, drawings=False)).text
+        "Calibration: nothing is known of it" in read(html(result, campaign, drawings=False)).text
+    )
+    runs = [replace(r, notes={"calibration": []}) for r in campaign.runs]
+    asked = replace(campaign, runs=tuple(runs))
+    assert (
+        "every pressure channel had one in force" in read(html(result, asked, drawings=False)).text
     )
     stale = {"calibration": ["p1: pistonphone of 2024-01-01 is stale"]}
     runs = [replace(r, notes=stale) for r in campaign.runs[:-1]]
@@ -230,6 +234,43 @@ def test_a_run_without_a_steady_state_does_not_stop_the_report() -> None:
     assert np.isnan(sizes[[c.run for c in rows_shown].index(lost.run)]).all()
     for figure in (heat_map(before, d.after), harmonics_figure(before, d.after)):
         assert "nan" not in to_svg(figure, "x").lower()
+
+
+def test_runs_that_are_excluded_do_not_stop_the_report() -> None:
+    """A run without its channel had ended the page, and with it the answer, in an error."""
+    found, campaign = material.identification(), material.recorded()
+    *others, last = campaign.runs
+    lost = replace(last, signals={"drive": last.signals["drive"]})
+    flags = (QualityFlag(last.name, "missing_channel", "no velocity", "excluded"),)
+    spoilt = replace(campaign, runs=(*others, lost))
+    assert "Fig" not in html(replace(found, quality=flags), spoilt, drawings=False)
+    names = [d.name for d in figures(replace(found, quality=flags), spoilt)]
+    assert "spectra" in names
+    every = tuple(replace(flags[0], run=r.name) for r in campaign.runs)
+    assert "spectra" not in [d.name for d in figures(replace(found, quality=every), campaign)]
+
+
+def test_every_foreign_tone_is_listed() -> None:
+    """All of them go by the same names: only the last had been shown."""
+    found = material.diagnosis()
+    tones = [
+        TracedEffect(
+            "interference",
+            "sensor",
+            "tone",
+            {"interference.frequency_hz": Estimate(hz, 0.01, "Hz")},
+        )
+        for hz in (50.0, 150.0)
+    ]
+    both = replace(
+        found,
+        effects=(*found.effects, *tones),
+        residual=replace(found.residual, significant=True, p_value=0.43),
+    )
+    said = read(html(both, drawings=False)).text
+    assert "50.000 ± 0.010 Hz" in said
+    assert "150.000 ± 0.010 Hz" in said
+    assert "residual is within the noise (p = 0.43), beside the foreign tones" in said
 
 
 def test_every_axis_is_named_with_its_unit() -> None:

@@ -4,6 +4,7 @@ from identify.characterise.analysis import (
     characterise,
     characterise_file,
     characterise_recording,
+    primary,
 )
 from identify.characterise.envelope import Estimate
 from identify.characterise.figure import figure
@@ -22,5 +23,6 @@ __all__ = [
     "characterise_recording",
     "figure",
     "identify_envelope",
+    "primary",
     "read_text",
 ]

@@ -113,12 +113,21 @@ def characterise(
     )
 
 
-def characterise_recording(recording: Recording, signal: str | None = None) -> Characterisation:
-    """Characterise one signal (default: the pressure, else the last); phases of all the others."""
+def primary(recording: Recording, signal: str | None = None) -> str:
+    """The name of the signal that is characterised: `signal`, else the pressure, else the last.
+
+    Raises ValueError where the recording has no such signal.
+    """
     names = list(recording.signals)
     chosen = signal or next((n for n in names if n.lower() in _PRIMARY), names[-1])
     if chosen not in recording.signals:
         raise ValueError(f"signal={chosen!r} is not one of {names}")
+    return chosen
+
+
+def characterise_recording(recording: Recording, signal: str | None = None) -> Characterisation:
+    """Characterise its `primary` signal; phases of all the others."""
+    chosen = primary(recording, signal)
     others = {name: y for name, y in recording.signals.items() if name != chosen}
     return characterise(
         recording.signals[chosen], recording.sample_rate_hz, others, unit=recording.unit

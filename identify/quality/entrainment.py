@@ -111,11 +111,14 @@ def foreign_cycle(views: Sequence[View]) -> list[QualityFlag]:
 
 
 def _beside(view: View, frequency_hz: float) -> float | None:
-    """Level of a line in a run's rest; None where it is too near to the run's harmonics."""
+    """Level of a line in a run's rest; None where it is too near to the run's harmonics, or beyond
+    its spectrum."""
     order = max(1, round(frequency_hz / view.frequency_hz))
     if abs(frequency_hz - order * view.frequency_hz) < 2 * MAIN_LOBE * view.bin_hz:
         return None
     centre = round(frequency_hz / view.bin_hz)
+    if not 0 < centre < view.spectrum.shape[1] - 1:
+        return None
     around = view.spectrum[:, centre - 1 : centre + 2]
     return float(np.linalg.norm(np.abs(around), axis=0).max())
 

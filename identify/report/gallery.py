@@ -1,6 +1,6 @@
 """All figures of a result, each with its name and caption: for the page, or as files."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -48,11 +48,14 @@ def figures(
 ) -> Iterator[Drawn]:
     """Every figure that the material allows; a fit that failed has none of its own."""
     before, after = assessments(result)
-    if campaign is not None:
+    excluded = {q.run for q in result.quality if q.severity == "excluded"}
+    highest = max((c.measured.size for c in before.comparisons), default=3)
+    recorded = None if campaign is None else spectra(campaign, highest, excluded)
+    if recorded is not None:
         yield Drawn(
             "spectra",
             "recordings",
-            spectra(campaign, max((c.measured.size for c in before.comparisons), default=3)),
+            recorded,
             "Amplitude spectra of the velocity (Hann window). Dashed: the free limit cycle's "
             "frequency; triangles: the forcing frequencies. An entrained run has one line, at the "
             "forcing frequency, and nothing at the limit cycle's.",
@@ -61,7 +64,7 @@ def figures(
         yield Drawn(
             "controller",
             "entrainment",
-            controller_steps(controller, _free_hz(before, campaign)),
+            controller_steps(controller, _free_hz(before, campaign, excluded)),
             "Left: how far the limit-cycle line fell below its free level at each step. Right: "
             "the lock-in tongue; its boundary lies in the shaded band.",
         )
@@ -151,10 +154,10 @@ def _of_models(before: Assessment, after: Assessment | None) -> Iterator[Drawn]:
     )
 
 
-def _free_hz(a: Assessment, campaign: Campaign | None) -> float | None:
+def _free_hz(a: Assessment, campaign: Campaign | None, excluded: Collection[str]) -> float | None:
     if a.measured_cycle is not None:
         return a.measured_cycle.frequency_hz
-    return None if campaign is None else free_frequency(campaign)
+    return None if campaign is None else free_frequency(campaign, excluded)
 
 
 def save_figures(

@@ -13,13 +13,11 @@ from identify.results import PLACES, Candidate, Diagnosis, Whereabouts
 
 FloatArray = npt.NDArray[np.float64]
 
-MOST = 14  # candidates shown; the table has them all
-
 
 @theme.styled
 def ranking(d: Diagnosis) -> Figure:
     """χ² per degree of freedom and validation error of each candidate beside the declared model."""
-    candidates = d.candidates[:MOST]
+    candidates = d.candidates
     # one effect a line: several in a row would leave the bars no room
     names = ["declared model", *(label(c).replace(" + ", " +\n") for c in candidates)]
     chi2 = np.array([d.before.chi2_per_dof, *(c.chi2_per_dof for c in candidates)])
@@ -92,7 +90,7 @@ def _noise(ax: Axes, x: float) -> None:
 
 
 def _colour(c: Candidate, d: Diagnosis) -> str:
-    claimed = sorted(e.effect for e in d.effects)
+    claimed = sorted(e.effect for e in d.effects if e.effect != "interference")
     if claimed and sorted(c.effects) == claimed:
         return theme.AFTER
     return theme.GOOD if c.adequate and c.plausible else theme.NOISE

@@ -12,6 +12,7 @@ from identify.report.gallery import Result, assessments
 from identify.report.page import paragraphs, table, tag, text
 from identify.report.words import percent, probability, scientific, with_error
 from identify.results import Assessment, Diagnosis, Identification, LimitCycle
+from identify.trace import ALPHA
 
 INADEQUATE = 2.0  # χ²/dof above which formal standard errors are called too small
 
@@ -222,7 +223,9 @@ def calibration(campaign: Campaign | None) -> str:
     """What is missing or stale; that nothing is, is said as well."""
     if campaign is None:
         return ""
-    said = campaign.calibration_remarks or ("every pressure channel had one in force",)
+    known = all("calibration" in r.notes for r in campaign.runs)
+    none = "every pressure channel had one in force" if known else "nothing is known of it"
+    said = campaign.calibration_remarks or (none,)
     return paragraphs(f"Calibration: {text}" for text in said)
 
 
@@ -278,9 +281,11 @@ def residual(result: Result) -> str:
     if not isinstance(result, Diagnosis):
         return ""
     r = result.residual
-    said = "exceeds the noise" if r.significant else "is within the noise"
-    lead = tag("p", text(f"The declared model's residual {said} ({words.p_is(r.p_value)})."))
-    return lead + signature(r.signature)
+    within = r.p_value >= ALPHA
+    said = "is within the noise" if within else "exceeds the noise"
+    tones = ", beside the foreign tones" if within and r.significant else ""
+    lead = f"The declared model's residual {said} ({words.p_is(r.p_value)}){tones}."
+    return tag("p", text(lead)) + signature(r.signature)
 
 
 def signature(values: Mapping[str, Any]) -> str:
@@ -349,7 +354,7 @@ def candidates(result: Result) -> str:
     if not isinstance(result, Diagnosis) or not result.candidates:
         return ""
     note = (
-        "p: of the gain in χ² over the next smaller model, corrected for the number of candidates "
+        "p: of the gain in χ² over the declared model, corrected for the number of candidates "
         "tried. Equivalent: predictions that these data cannot tell apart."
     )
     details = [

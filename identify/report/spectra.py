@@ -5,6 +5,7 @@ neighbourhood of the limit cycle with all forced runs. Entrainment shows as one 
 forcing frequency, and nothing left at the free limit cycle's.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,24 +66,29 @@ def velocity_spectrum(run: Run, medium: Medium) -> Spectrum:
     )
 
 
-def free_frequency(campaign: Campaign) -> float | None:
-    """The free limit cycle's frequency (Hz) from the first free run, None without one."""
+def free_frequency(campaign: Campaign, excluded: Collection[str] = ()) -> float | None:
+    """The free limit cycle's frequency (Hz) from the first free run that is not excluded, None
+    without one."""
     for run in campaign.runs:
-        if run.kind == "free":
+        if run.kind == "free" and run.name not in excluded:
             signal = next(s for s in run.signals.values() if s.quantity in ("pressure", "velocity"))
             return estimate_frequency(np.asarray(signal.values, dtype=float), run.sample_rate_hz)
     return None
 
 
 @theme.styled
-def spectra(campaign: Campaign, harmonics: int = 3) -> Figure:
-    """Fig. 5.3: free and forced spectra, broad and near the limit cycle."""
-    runs = [r for r in campaign.runs if r.exit_status == "success" and r.kind != "cold"]
-    runs = [r for r in runs if all(np.isfinite(s.values).all() for s in r.signals.values())]
+def spectra(
+    campaign: Campaign, harmonics: int = 3, excluded: Collection[str] = ()
+) -> Figure | None:
+    """Fig. 5.3: free and forced spectra, broad and near the limit cycle; of runs that are not
+    `excluded`. None where there is none."""
+    runs = [r for r in campaign.runs if r.kind != "cold" and r.name not in excluded]
     spectrum = [velocity_spectrum(r, campaign.medium) for r in runs]
     free = next((s for s in spectrum if s.kind == "free"), None)
     forced = sorted((s for s in spectrum if s.forcing_hz), key=lambda s: s.forcing_hz or 0.0)
-    free_hz = free_frequency(campaign)
+    free_hz = free_frequency(campaign, excluded)
+    if free_hz is None and not forced:
+        return None
     centre = free_hz if free_hz is not None else float(np.median([s.forcing_hz for s in forced]))
     figure, axes = theme.panels(
         3.1, 1, 2, theme.Margins(across=0.2), widths=(1.15, 1.0), sharey=True

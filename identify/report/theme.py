@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from functools import wraps
 from io import BytesIO, StringIO
 from threading import RLock
-from typing import Any, Literal, ParamSpec
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 P = ParamSpec("P")
+T = TypeVar("T")
 
 # name of the style sheet's variable -> colour on light ground; no two alike, since the SVG's
 # colours are found again by their value
@@ -95,11 +96,11 @@ _SETTINGS: dict[Any, Any] = {
 }
 
 
-def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
+def styled(draw: Callable[P, T]) -> Callable[P, T]:
     """A drawing function under this module's settings."""
 
     @wraps(draw)
-    def inside(*args: P.args, **kwargs: P.kwargs) -> Figure:
+    def inside(*args: P.args, **kwargs: P.kwargs) -> T:
         with _LOCK, mpl.rc_context(_SETTINGS):
             return draw(*args, **kwargs)
 

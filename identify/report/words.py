@@ -134,8 +134,9 @@ def _diagnosis(d: Diagnosis) -> Heading:
     if d.verdict == "traced":
         where = joined(tuple(f"{e.effect}{_forms(e)}, {e.location}" for e in d.effects))
         headline = f"Traced: {where}"
-        parts = {n: x for e in d.effects for n, x in e.parameters.items()}
-        evidence.append(f"Added to the model: {listed(parts)}.")
+        # tone by tone: all of them go by the same names
+        parts = "; ".join(listed(e.parameters) for e in d.effects)
+        evidence.append(f"Added to the model: {parts}.")
         evidence.append(_misfit("With it the model", d.after))
     elif d.verdict == "ambiguous":
         adequate = [label(c) for c in d.candidates if c.adequate and c.plausible]

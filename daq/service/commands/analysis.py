@@ -113,14 +113,14 @@ def identify(
     quiet = str(json_) == "-"
     with progress_bar(quiet) as tell:
         found = run(recorded, structure=structure, progress=tell)
+    if not quiet:
+        show_identification(found)
+        show_calibration(recorded)
     write_json(json_, found.to_json())
     if html is not None:
         from identify.report import write_html
 
         write_html(html, found, recorded, steps)
-    if not quiet:
-        show_identification(found)
-        show_calibration(recorded)
     if not found.assessment.fit.converged:
         raise typer.Exit(1)
 
@@ -152,17 +152,17 @@ def diagnose(
     quiet = str(json_) == "-"
     with executor(processes) as workers, progress_bar(quiet) as tell:
         found = run(recorded, progress=tell, executor=workers)
-    if not Path(campaign).is_dir():
-        with open_store(store) as target:
-            target.set_status(campaign, verdict=found.verdict)
+    if not quiet:
+        show_diagnosis(found)
+        show_calibration(recorded)
     write_json(json_, found.to_json())
     if html is not None:
         from identify.report import write_html
 
         write_html(html, found, recorded, steps)
-    if not quiet:
-        show_diagnosis(found)
-        show_calibration(recorded)
+    if not Path(campaign).is_dir():
+        with open_store(store) as target:
+            target.set_status(campaign, verdict=found.verdict)
 
 
 def show_calibration(recorded: "Campaign") -> None:
@@ -175,7 +175,12 @@ def show_identification(found: "Identification") -> None:
     """Print an identification."""
     a = found.assessment
     if not a.fit.converged:
-        out.print(f"the fit did not converge: {a.fit.reason}", markup=False)
+        out.print(
+            f"the fit did not converge: {a.fit.reason}. Look at what is said of the recordings; "
+            "`entrain diagnose` seeks what the declared model lacks.",
+            markup=False,
+        )
+        show_quality(found)
         return
     show_parameters("parameters", found.to_json()["parameters"])
     table(
@@ -291,6 +296,8 @@ def show_diagnosis(found: "Diagnosis") -> None:
     if found.next_experiment:
         out.print(f"next experiment: {found.next_experiment['reason']}", markup=False)
         out.print("run it: --json FILE, then `entrain campaign run FILE`", markup=False)
+    elif any(q.flag == "contradicts_alone" for q in found.quality):
+        out.print("next experiment: record the doubted run again")
     elif found.verdict == "ambiguous" or found.whereabouts is not None:
         out.print("next experiment: none within the rig's reach tells the nearest apart")
 
@@ -338,7 +345,7 @@ def characterise(
     """Regime, frequency, amplitude, harmonics, growth rate of an unforced oscillation."""
     from daq.errors import InputError
     from daq.service.words import read_unforced
-    from identify.characterise import characterise_recording
+    from identify.characterise import characterise_recording, primary
     from identify.characterise import figure as draw
 
     recording = read_unforced(file, name or [], rate_hz)
@@ -346,13 +353,12 @@ def characterise(
         found = characterise_recording(recording, signal)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from error
-    write_json(json_, found.to_json())
-    if figure is not None:
-        names = list(recording.signals)
-        chosen = signal or next((n for n in names if n.lower().startswith("p")), names[-1])
-        draw(found, recording.signals[chosen], figure, title=file.name)
     if str(json_) != "-":
         show_characterisation(found.to_json())
+    write_json(json_, found.to_json())
+    if figure is not None:
+        chosen = primary(recording, signal)
+        draw(found, recording.signals[chosen], figure, title=f"{file.name}, {chosen}")
 
 
 def show_characterisation(found: dict[str, Any]) -> None:
@@ -372,3 +378,5 @@ def show_characterisation(found: dict[str, Any]) -> None:
         *((f"phase of {k}", pair(v, "°")) for k, v in found["phase_deg"].items()),
     ]
     table("", ("", ""), rows)
+    for note in found["notes"]:
+        out.print(f"note: {note}", markup=False)

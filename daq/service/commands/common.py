@@ -23,11 +23,25 @@ err = Console(stderr=True, highlight=False)
 StoreOption = Annotated[
     Path | None, typer.Option("--store", help="Run store; else the configured one.")
 ]
+
+
+def _writable(place: Path | None) -> Path | None:
+    """Refuse a place that cannot be written to before the work that it is for."""
+    if place is None or str(place) == "-":
+        return place
+    if place.is_dir() or not place.parent.is_dir():
+        what = "a folder" if place.is_dir() else f"in no folder: {place.parent} does not exist"
+        raise typer.BadParameter(f"{str(place)!r} is {what}; give a file in a folder that exists")
+    return place
+
+
 JsonOption = Annotated[
-    Path | None, typer.Option("--json", help="Also write the result as JSON; - for stdout.")
+    Path | None,
+    typer.Option("--json", help="Also write the result as JSON; - for stdout.", callback=_writable),
 ]
 HtmlOption = Annotated[
-    Path | None, typer.Option("--html", help="Also write a self-contained HTML report.")
+    Path | None,
+    typer.Option("--html", help="Also write a self-contained HTML report.", callback=_writable),
 ]
 
 

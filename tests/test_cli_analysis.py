@@ -1,0 +1,64 @@
+"""What the commands that analyse do before and after their long work."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from identify.characterise import Recording, primary
+from tests.test_cli_data import entrain, home
+
+__all__ = ["home"]
+
+
+@pytest.mark.parametrize("command", ["diagnose", "identify"])
+@pytest.mark.parametrize("option", ["--json", "--html"])
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(
+    home: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    option: str,
+) -> None:
+    """The search had been done, and its result lost."""
+    case = Path(__file__).parent / "data" / "b-flame-delay"
+
+    def searched(*args: object, **kwargs: object) -> None:
+        raise AssertionError("searched first")
+
+    monkeypatch.setattr("identify.diagnosis.diagnose", searched)
+    monkeypatch.setattr("identify.identification.identify", searched)
+    for place, says in (("nowhere/found.out", "nowhere does not exist"), (".", "is a folder")):
+        code, out, err = entrain(capfd, command, case, option, place)
+        assert (code, out) == (2, "")
+        assert says in " ".join(err.replace("│", " ").split())
+
+
+def test_the_signal_that_is_characterised_is_the_one_drawn(
+    home: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`photodiode` begins with p, and had been drawn for the pressure."""
+    t = np.arange(20000) / 5000.0
+    rng = np.random.default_rng(1)
+    rows = [np.sin(2 * np.pi * 170 * t + a) + 0.01 * rng.standard_normal(t.size) for a in (0, 1)]
+    recording = Recording({"photodiode": rows[0], "mic": rows[1]}, 5000.0, None, "V")
+    assert primary(recording) == "mic"
+    assert primary(recording, "photodiode") == "photodiode"
+    with pytest.raises(ValueError, match="signal='p1' is not one of"):
+        primary(recording, "p1")
+    file = home / "two.csv"
+    np.savetxt(file, np.c_[t, rows[0], rows[1]], delimiter=",")
+    drawn: list[np.ndarray] = []
+
+    def draw(found: object, values: np.ndarray, place: Path, title: str) -> None:
+        drawn.append(values)
+        assert title == "two.csv, mic"
+
+    monkeypatch.setattr("identify.characterise.figure", draw)
+    words = ("characterise", file, "--name", "photodiode", "--name", "mic", "--figure", "a.svg")
+    code, out, _ = entrain(capfd, *words, "--json", "found.json")
+    assert code == 0
+    np.testing.assert_allclose(drawn[0], rows[1])
+    for note in json.loads((home / "found.json").read_text("utf-8"))["notes"]:
+        assert note[:40] in out
