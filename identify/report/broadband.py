@@ -92,7 +92,7 @@ def evidence(found: BroadbandDiagnosis) -> list[str]:
             f"{_most(found)}."
         )
     if spoilt(found.quality):
-        lines.append("The recording is spoilt (see below): nothing is claimed from it.")
+        lines.append("The recording is spoilt (see its flags): nothing is claimed from it.")
     tried = [w.score.candidate.kind for w in found.weighed if w not in found.claims]
     if tried:
         lines.append(f"Tried and not claimed: {joined(tuple(tried))}.")

@@ -137,13 +137,17 @@ def diagnose(
     from daq.importers.broadband import is_broadband
 
     if is_broadband(campaign):
+        if operating_point is not None:
+            raise InputError(
+                f"operating_point={operating_point!r}: a broadband recording has none; leave it out"
+            )
         with progress_bar(str(json_) == "-") as tell:
             traced = broadband.diagnose(campaign, tell)
+        if str(json_) != "-":
+            broadband.show(traced)
         write_json(json_, traced.to_json())
         if html is not None:
             broadband.report(html, traced)
-        if str(json_) != "-":
-            broadband.show(traced)
         return
     from identify.diagnosis import diagnose as run
     from identify.executor import executor
@@ -343,7 +347,6 @@ def characterise(
     ] = None,
 ) -> None:
     """Regime, frequency, amplitude, harmonics, growth rate of an unforced oscillation."""
-    from daq.errors import InputError
     from daq.service.words import read_unforced
     from identify.characterise import characterise_recording, primary
     from identify.characterise import figure as draw

@@ -72,3 +72,6 @@ def show(found: "BroadbandDiagnosis") -> None:
     out.print(f"{headline(found)} ({found.seconds:.0f} s)", markup=False)
     for line in evidence(found):
         out.print(f"  {line}", markup=False)
+    following = found.to_json()["next_experiment"]
+    if following is not None:
+        out.print(f"next experiment: {following['excitation']}: {following['why']}", markup=False)

@@ -90,10 +90,13 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def write_json(place: Path | None, content: dict[str, Any]) -> None:
-    """Write `content` to `place`, or to stdout for ``-``; nothing for None."""
+    """Write `content` to `place`, or to stdout for ``-``; nothing for None. What is no finite
+    number is null."""
+    from daq.service.plain import plain
+
     if place is None:
         return
-    text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(plain(content), indent=2, ensure_ascii=False, allow_nan=False)
     if str(place) == "-":
         sys.stdout.write(text + "\n")
     else:
