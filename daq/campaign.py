@@ -131,7 +131,7 @@ def require_ready(plan: Plan, rig: DuplexRig) -> None:
     if plan.design is not None and not (plan.conditions or plan.cold):
         raise CampaignError(
             f"the design from campaign {plan.design.campaign!r} has no conditions yet: "
-            "`daq.service.designing.resolved` chooses them"
+            "`entrain campaign run` and `entrain close-loop` choose them, or list conditions"
         )
     require_operable(plan.operating_points, operating_ranges(rig))
 

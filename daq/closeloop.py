@@ -2,7 +2,8 @@
 
     plan ──> campaign ──> diagnosis ──┬── traced, no_discrepancy: done
       ^                               ├── ambiguous, unexplained: its next experiment is the plan
-      └───────────────────────────────┘    (none proposed, or no rig time left: done, unanswered)
+      │                               ├── one run alone contradicts: its condition, once more
+      └───────────────────────────────┘    (none of these, or no rig time left: done, unanswered)
 
 The loop is pure bookkeeping: how a campaign is recorded and diagnosed is injected (`Steps`), and
 both must be repeatable: a round that is recorded is not recorded again, one that is diagnosed not
@@ -10,11 +11,12 @@ diagnosed again. So a loop that was interrupted goes on by being run once more u
 rounds are the campaigns NAME, NAME-2, NAME-3, …, each continuing the one before (`daq.continued`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal, Protocol
 
-from daq.plan import Plan, parse_plan
+from daq.plan import Condition, Plan, parse_plan
+from daq.records import RunSummary
 
 Ending = Literal["traced", "adequate", "no_proposal", "out_of_budget", "stopped"]
 FORMAT = "close-loop/1"
@@ -48,6 +50,9 @@ class Steps(Protocol):
     def diagnose(self, campaign: str) -> dict[str, Any] | None:
         """The campaign's diagnosis as ``diagnosis/1``, all it continues included; None when it was
         stopped on the way."""
+
+    def run(self, run: str) -> RunSummary:
+        """What was recorded as ``campaign/name``."""
 
     def expected_seconds(self, plan: Plan) -> float:
         """Rig time that a plan needs, about."""
@@ -84,16 +89,18 @@ class Round:
 
 @dataclass(frozen=True)
 class Closed:
-    """All rounds, how it ended and why."""
+    """All rounds, how it ended and why; `unfinished_seconds` of rig time went into a campaign that
+    was stopped before its diagnosis stood."""
 
     name: str
     rounds: tuple[Round, ...]
     ending: Ending
     reason: str
+    unfinished_seconds: float = 0.0
 
     @property
     def rig_seconds(self) -> float:
-        return sum(r.rig_seconds for r in self.rounds)
+        return sum(r.rig_seconds for r in self.rounds) + self.unfinished_seconds
 
     def to_json(self) -> dict[str, Any]:
         """As ``close-loop/1``."""
@@ -123,9 +130,10 @@ def close_loop(
     """
     most = budget or Budget()
     rounds: list[Round] = []
+    again: dict[str, str] = {}  # doubted run -> campaign that has its condition once more
 
-    def end(ending: Ending, reason: str) -> Closed:
-        return Closed(name, tuple(rounds), ending, reason)
+    def end(ending: Ending, reason: str, unfinished_s: float = 0.0) -> Closed:
+        return Closed(name, tuple(rounds), ending, reason, unfinished_s)
 
     wanted = plan
     for number in range(1, most.rounds + 1):
@@ -140,10 +148,12 @@ def close_loop(
         campaign = campaign_of(name, number)
         recorded = steps.record(campaign, wanted)
         if recorded.status != "complete":
-            return end("stopped", f"campaign {campaign}: {recorded.reason or recorded.status}")
+            why = recorded.reason or recorded.status
+            return end("stopped", f"campaign {campaign}: {why}", recorded.rig_seconds)
         found = steps.diagnose(campaign)
         if found is None:
-            return end("stopped", f"the diagnosis of campaign {campaign} was stopped")
+            why = f"the diagnosis of campaign {campaign} was stopped"
+            return end("stopped", why, recorded.rig_seconds)
         rounds.append(_round(number, campaign, recorded, found))
         tell(rounds[-1])
         if found["verdict"] == "traced":
@@ -151,10 +161,41 @@ def close_loop(
         if found["verdict"] == "no_discrepancy":
             return end("adequate", found["explanation"])
         proposed = (found["next_experiment"] or {}).get("plan")
-        if proposed is None:
-            return end("no_proposal", "no run within the rig's limits would tell much more")
-        wanted = following(plan, parse_plan(proposed, "next_experiment"), campaign)
+        if proposed is not None:
+            wanted = following(plan, parse_plan(proposed, "next_experiment"), campaign)
+            continue
+        doubted = doubted_run(found, campaign)
+        if doubted is None:
+            return end("no_proposal", found["explanation"])
+        if doubted in again:
+            return end(
+                "no_proposal",
+                f"{found['explanation']} Campaign {again[doubted]} had its condition once more; "
+                "still it is the only one that contradicts.",
+            )
+        again[doubted] = campaign_of(name, number + 1)
+        wanted = following(plan, once_more(steps.run(doubted)), campaign)
     return end("out_of_budget", f"{most.rounds} rounds are done")
+
+
+def doubted_run(found: Mapping[str, Any], campaign: str) -> str | None:
+    """The one run that alone contradicts the declared model, as ``campaign/name``."""
+    flags = found.get("quality", ())
+    runs = [str(flag["run"]) for flag in flags if flag["flag"] == "contradicts_alone"]
+    if not runs:
+        return None
+    return runs[0] if "/" in runs[0] else f"{campaign}/{runs[0]}"
+
+
+def once_more(run: RunSummary) -> Plan:
+    """A run by itself, driven as it was; every plan begins with a free one, which needs no more."""
+    condition = Condition(run.frequency_hz, amplitude_v=run.amplitude_v, role=run.role)
+    return Plan(
+        title=f"once more: {run.name}",
+        conditions=(condition,) if run.kind == "forced" else (),
+        cold=(condition,) if run.kind == "cold" else (),
+        record_s=run.samples / run.sample_rate_hz,
+    )
 
 
 def following(first: Plan, proposed: Plan, campaign: str) -> Plan:
@@ -166,6 +207,7 @@ def following(first: Plan, proposed: Plan, campaign: str) -> Plan:
         cold=proposed.cold,
         free_runs=proposed.free_runs,
         record_s=proposed.record_s,
+        design=None,
         continues=campaign,
     )
 

@@ -10,8 +10,10 @@ import pytest
 
 from daq.campaign import StopRequested, run_campaign
 from daq.closeloop import Budget, Closed, Recorded, close_loop
+from daq.designed import Design
 from daq.errors import InputError
 from daq.plan import Condition, Plan, parse_plan, read_plan
+from daq.records import Kind, RunSummary
 from daq.service.loop_work import RigSteps, turn
 from daq.store import RunStore
 from identify.load import load_campaign
@@ -45,6 +47,13 @@ class Scripted:
     def expected_seconds(self, plan: Plan) -> float:
         return 600.0
 
+    def run(self, run: str) -> RunSummary:
+        campaign, _, name = run.partition("/")
+        return RunSummary(
+            campaign, name, DRIVEN[name], "validation", 172.0, 0.7, 0.0, "", "rig", 10_000.0,
+            15_000, "success", "", "", 0,
+        )  # fmt: skip
+
     def record(self, campaign: str, plan: Plan) -> Recorded:
         self.plans.append((campaign, plan))
         return Recorded(self.status, "interlock open", 600.0, 5)
@@ -72,9 +81,11 @@ AMBIGUOUS = diagnosis("ambiguous", NEXT)
 def test_a_loop_ends_with_a_verdict_or_with_its_budget(
     verdicts: list[dict[str, Any] | None], budget: Budget, ending: str, rounds: int
 ) -> None:
-    closed = close_loop("loop", FIRST, Scripted(list(verdicts)), budget)
+    steps = Scripted(list(verdicts))
+    closed = close_loop("loop", FIRST, steps, budget)
     assert (closed.ending, len(closed.rounds)) == (ending, rounds)
-    assert closed.rig_seconds == 600.0 * rounds
+    # a campaign whose diagnosis was stopped took its ten minutes too
+    assert closed.rig_seconds == closed.to_json()["rig_seconds"] == 600.0 * len(steps.plans)
     assert closed.reason
 
 
@@ -87,8 +98,53 @@ def test_each_round_continues_the_one_before_and_keeps_the_first_plans_care() ->
     assert second.conditions == (Condition(frequency_hz=172.0, amplitude_v=1.0),)
     assert (second.record_s, second.limit_v, second.max_drift) == (4.0, 2.0, 0.1)
     stopped = close_loop("loop", FIRST, Scripted([], status="stopped"))
-    assert (stopped.ending, stopped.rounds) == ("stopped", ())
+    assert (stopped.ending, stopped.rounds, stopped.rig_seconds) == ("stopped", (), 600.0)
     assert "interlock open" in stopped.reason
+
+
+def test_a_round_that_a_diagnosis_planned_is_of_no_design() -> None:
+    """Else the precision that is expected of it would be reckoned from the design's campaign."""
+    steps = Scripted([AMBIGUOUS, diagnosis("traced")])
+    close_loop("loop", replace(FIRST, design=Design("known")), steps)
+    assert [plan.design for _, plan in steps.plans] == [Design("known"), None]
+
+
+DRIVEN: dict[str, Kind] = {"002-forced": "forced", "003-cold": "cold", "000-free": "free"}
+
+
+def doubting(run: str) -> dict[str, Any]:
+    flags = [{"run": run, "flag": "contradicts_alone", "detail": "", "severity": "warning"}]
+    return {**diagnosis("unexplained"), "explanation": f"without {run}", "quality": flags}
+
+
+def test_the_condition_of_a_run_that_alone_contradicts_is_recorded_once_more() -> None:
+    """No experiment is proposed then, since none was looked for: not since none would tell."""
+    driven = Condition(frequency_hz=172.0, amplitude_v=0.7, role="validation")
+    steps = Scripted([doubting("002-forced"), diagnosis("no_discrepancy")])
+    closed = close_loop("loop", FIRST, steps)
+    assert (closed.ending, len(closed.rounds)) == ("adequate", 2)
+    second = steps.plans[1][1]
+    assert (second.conditions, second.cold, second.free_runs) == ((driven,), (), 1)
+    assert (second.record_s, second.continues, second.limit_v) == (1.5, "loop", 2.0)
+
+    # a run of an earlier campaign has that one's name before its own; nothing is repeated twice
+    verdicts = [AMBIGUOUS, doubting("loop/003-cold"), doubting("loop/003-cold")]
+    steps = Scripted(verdicts)
+    closed = close_loop("loop", FIRST, steps)
+    assert (closed.ending, len(closed.rounds)) == ("no_proposal", 3)
+    third = steps.plans[2][1]
+    assert (third.conditions, third.cold, third.continues) == ((), (driven,), "loop-2")
+    assert closed.reason.startswith("without loop/003-cold Campaign loop-3 had its condition once")
+
+    # a free run comes with every plan
+    steps = Scripted([doubting("000-free"), diagnosis("traced")])
+    assert close_loop("loop", FIRST, steps).ending == "traced"
+    assert (steps.plans[1][1].conditions, steps.plans[1][1].cold) == ((), ())
+
+
+def test_a_loop_without_a_proposal_ends_with_the_diagnosis_own_words() -> None:
+    closed = close_loop("loop", FIRST, Scripted([diagnosis("unexplained")]))
+    assert (closed.ending, closed.reason) == ("no_proposal", "unexplained")
 
 
 SMALL = parse_plan(
@@ -128,12 +184,15 @@ def test_a_loop_on_a_rig_stops_goes_on_and_reaches_its_verdict(store: RunStore) 
     with build_rig(seed=3, noise_db=40.0) as rig:
         first = turn("loop", SMALL, RigSteps(rig, store, impatient, heard), store, Budget())
         assert (first.ending, first.reason) == ("stopped", "campaign loop: enough for today")
+        # a free run of a second, two looks of one before it, and a condition's windows
+        assert 4.0 < first.rig_seconds < 60.0
         done = {run.name for run in store.campaign_runs("loop")}
         assert done
         closed: Closed = turn("loop", SMALL, RigSteps(rig, store, lambda: None), store, Budget())
     assert closed.ending == "adequate", closed.reason
     (only,) = closed.rounds
     assert only.runs == 7
+    assert closed.rig_seconds == only.rig_seconds > first.rig_seconds
     assert done < {run.name for run in store.campaign_runs("loop")}
     assert store.card("loop").verdict == "no_discrepancy"
     kept = json.loads((store.campaign_dir("loop") / "loop.json").read_text("utf-8"))
@@ -144,6 +203,22 @@ def test_a_loop_on_a_rig_stops_goes_on_and_reaches_its_verdict(store: RunStore) 
 
 def _never() -> None:
     raise AssertionError("the rig was asked again")
+
+
+def test_a_doubted_run_is_recorded_once_more_on_the_rig(store: RunStore) -> None:
+    """Its diagnosis is written by hand: one run of the first campaign is doubted."""
+    with build_rig(seed=3, noise_db=40.0) as rig:
+        run_campaign(rig, SMALL, store, campaign_id="loop")
+        (doubted,) = (r for r in store.campaign_runs("loop") if r.name.startswith("002-"))
+        path = store.campaign_dir("loop") / "diagnosis.json"
+        path.write_text(json.dumps(doubting(doubted.name)), "utf-8")
+        closed = turn("loop", SMALL, RigSteps(rig, store, lambda: None), store, Budget())
+    assert [(r.campaign, r.runs) for r in closed.rounds] == [("loop", 7), ("loop-2", 2)]
+    free, again = store.campaign_runs("loop-2")
+    assert (free.kind, again.kind, again.role) == ("free", doubted.kind, doubted.role)
+    driven = ("frequency_hz", "amplitude_v", "samples")
+    assert [getattr(again, n) for n in driven] == [getattr(doubted, n) for n in driven]
+    assert closed.ending == "adequate", closed.reason
 
 
 def test_a_campaign_that_continues_another_is_read_with_it(store: RunStore) -> None:

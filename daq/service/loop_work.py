@@ -1,23 +1,29 @@
 """The closed loop on a rig that is open: what `daq.closeloop` asks for, done with the run store.
 
 Everything a loop leaves lies in the store: its campaigns, in each one's folder the diagnosis
-(`diagnosis.json`), and in the first one's the account of the whole (`loop.json`).
+(`diagnosis.json`), and in the first one's the account of the whole (`loop.json`). Options that were
+laid over the configured rig's (a simulated one's seed, or seal) stand in the campaigns' notes, so
+that a loop which is taken up again goes on with the same plant.
 """
 
 import contextlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from daq.campaign import Event, SkipRequested, StopRequested, run_campaign
 from daq.closeloop import Budget, Closed, Recorded, Round, Steps, close_loop
+from daq.errors import InputError
 from daq.events import Control, OnEvent
 from daq.journal import read_journal
 from daq.plan import Plan, parse_plan
+from daq.records import RunSummary
 from daq.schedule import elapsed
 from daq.service.analysis_work import steps_in
 from daq.service.campaign_names import begun_with
+from daq.service.designing import resolved
 from daq.service.dry_run import dry_run
 from daq.service.jobs import Link
 from daq.service.observed import observe
@@ -25,6 +31,7 @@ from daq.service.plain import plain
 from daq.service.rig_work import Helm, describe
 from daq.service.rigs import RigEntry, open_rig
 from daq.store import RunStore, write_json
+from daq.store_file import read_summary
 from drivers.protocols import DuplexRig
 from identify.diagnosis import diagnose
 from identify.load import load_campaign
@@ -33,13 +40,14 @@ from identify.results import Diagnosis
 from identify.trace import Cancelled
 
 Progress = Callable[[float, str], None]
+RIG_OPTIONS = "rig_options"  # in a card's notes
 
 
 class RigSteps:
     """`daq.closeloop.Steps` on an open rig and a store.
 
     `control` is heeded between windows and asked during a diagnosis: when it raises
-    `StopRequested`, the loop ends, and can go on later.
+    `StopRequested`, the loop ends, and can go on later. `rig_options` are those of `laid_over`.
     """
 
     def __init__(
@@ -49,35 +57,46 @@ class RigSteps:
         control: Control,
         on_event: OnEvent | None = None,
         progress: Progress | None = None,
+        rig_options: Mapping[str, Any] | None = None,
     ) -> None:
         self._rig = rig
         self._store = store
         self._control = control
+        self._rig_options = dict(rig_options or {})
         self.on_event = on_event
         self.progress = progress
         self.last: Diagnosis | None = None
+
+    def run(self, run: str) -> RunSummary:
+        return read_summary(self._store.run_path(run), run.partition("/")[0])
 
     def expected_seconds(self, plan: Plan) -> float:
         report = dry_run(plan, self._rig.limits, self._rig.sample_rate_hz)
         return float(report["rig_seconds"])
 
     def record(self, campaign: str, plan: Plan) -> Recorded:
+        def heard(event: Event) -> None:
+            if event.kind == "started":
+                self._keep_options(campaign)
+            if self.on_event is not None:
+                self.on_event(event)
+
         begun = (self._store.campaigns_dir / campaign / "campaign.json").is_file()
+        status, reason = "complete", ""
         if not begun or self._store.card(campaign).status != "complete":
             result = run_campaign(
                 self._rig,
                 plan,
                 self._store,
-                self.on_event,
+                heard,
                 control=self._control,
                 campaign=campaign if begun else None,
                 campaign_id="" if begun else campaign,
             )
-            if result.status != "complete":
-                return Recorded(result.status, result.reason, 0.0, 0)
+            status, reason = result.status, result.reason
         lines = read_journal(self._store.campaign_dir(campaign) / "journal.jsonl")
         seconds = elapsed(lines) - float(lines[0]["time_s"])
-        return Recorded("complete", "", seconds, len(self._store.campaign_runs(campaign)))
+        return Recorded(status, reason, seconds, len(self._store.campaign_runs(campaign)))
 
     def diagnose(self, campaign: str) -> dict[str, Any] | None:
         folder = self._store.campaign_dir(campaign)
@@ -96,6 +115,13 @@ class RigSteps:
         self._store.set_status(campaign, verdict=found.verdict)
         return answer
 
+    def _keep_options(self, campaign: str) -> None:
+        """At once, so that they are known however the campaign ends."""
+        card = self._store.card(campaign)
+        if RIG_OPTIONS not in card.notes:
+            notes = {**card.notes, RIG_OPTIONS: self._rig_options}
+            self._store.save_card(replace(card, notes=notes))
+
     def _cancelled(self) -> bool:
         try:
             self._control()
@@ -104,6 +130,33 @@ class RigSteps:
         except SkipRequested:  # there is no condition to leave out
             pass
         return False
+
+
+def laid_over(
+    rig: RigEntry, given: Mapping[str, Any], store: RunStore, loop: str | None
+) -> dict[str, Any]:
+    """The options to lay over the configured rig's: those `given`, or, to go on with `loop`, those
+    that it began with.
+
+    Raises `InputError` where what is given would make another rig of the one that it began with.
+    """
+    card = None if loop is None else store.card(loop)
+    if card is not None and card.rig not in ("", rig.name):
+        raise InputError(
+            f"rig={rig.name!r}: loop {loop!r} began on rig {card.rig!r}, and one analysis needs "
+            "one rig: leave --rig out, or begin a new loop"
+        )
+    if card is None or RIG_OPTIONS not in card.notes:
+        return dict(given)
+    kept = dict(card.notes[RIG_OPTIONS])
+    began = {**rig.options, **kept}
+    for key, value in given.items():
+        if began.get(key) != value:
+            raise InputError(
+                f"{key}={value!r}: loop {loop!r} began with {began.get(key, 'the default')!r}, and "
+                "one analysis needs one rig: leave --seed and --sealed out, or begin a new loop"
+            )
+    return kept
 
 
 def turn(
@@ -144,15 +197,26 @@ def work(
     """A loop as a job of the service; returns its account (close-loop/1)."""
     budget = Budget(rounds, rig_minutes)
     with contextlib.closing(RunStore(Path(store))) as runs:
-        wanted = begun_with(runs, name) if resume else parse_plan(plan)
-        device = open_rig(RigEntry(**rig))
+        entry = RigEntry(**rig)
+        laid = laid_over(entry, {}, runs, name if resume else None)
+        wanted = begun_with(runs, name) if resume else _ready(plan, runs, link)
+        device = open_rig(replace(entry, options={**entry.options, **laid}))
         with observe(device, link.event) as watched:
             helm = Helm(link, device)
             progress = Teller(link, budget)
-            steps = RigSteps(watched, runs, helm.heed, progress.event, progress.diagnosis)
+            steps = RigSteps(
+                watched, runs, helm.heed, progress.event, progress.diagnosis, rig_options=laid
+            )
             closed = turn(name, wanted, steps, runs, budget, progress.round)
         write_report(Path(report), steps.last, runs)
     return closed.to_json()
+
+
+def _ready(plan: dict[str, Any], runs: RunStore, link: Link) -> Plan:
+    """The plan with the conditions of its design, chosen before the rig is opened."""
+    return resolved(
+        parse_plan(plan), runs, lambda share, text: link.progress(0.0, f"design: {text}")
+    )
 
 
 def write_report(path: Path, last: Diagnosis | None, store: RunStore) -> None:

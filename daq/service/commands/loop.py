@@ -25,17 +25,19 @@ from daq.service.commands.rig import (
     choose_rig,
     interruptible,
     read,
+    ready,
 )
 
 if TYPE_CHECKING:
     from daq.closeloop import Closed, Recorded, Round
     from daq.plan import Plan
+    from daq.records import RunSummary
     from daq.service.loop_work import RigSteps
 
 ENDINGS = {
     "traced": "what the model lacked is found",
     "adequate": "the declared model explains the data to within noise",
-    "no_proposal": "nothing that the rig can do would tell more",
+    "no_proposal": "the cause is open, and the diagnosis proposes no further experiment",
     "out_of_budget": "the budget is spent",
     "stopped": "stopped; `entrain close-loop --resume {name}` goes on",
 }
@@ -47,6 +49,9 @@ class Shown:
     def __init__(self, steps: "RigSteps", quiet: bool) -> None:
         self._steps = steps
         self._quiet = quiet
+
+    def run(self, run: str) -> "RunSummary":
+        return self._steps.run(run)
 
     def expected_seconds(self, plan: "Plan") -> float:
         return self._steps.expected_seconds(plan)
@@ -102,15 +107,18 @@ def close_loop(
         if stop:
             raise StopRequested("interrupted at the keyboard")
 
+    given: dict[str, Any] = {} if seed is None else {"seed": seed}
+    if sealed:
+        given["effects"] = "sealed"
     with open_store(store) as target:
-        first = read(plan) if resume is None else begun_with(target, resume)
-        entry = choose_rig(rig or (target.card(resume).rig if resume else None), seed)
-        if sealed:
-            if entry.driver != SIMULATED:
-                raise InputError(f"--sealed: rig {entry.name!r} is not a simulated one")
-            entry = replace(entry, options={**entry.options, "effects": "sealed"})
+        first = ready(read(plan), store) if resume is None else begun_with(target, resume)
+        entry = choose_rig(rig or (target.card(resume).rig if resume else None))
+        if sealed and entry.driver != SIMULATED:
+            raise InputError(f"--sealed: rig {entry.name!r} is not a simulated one")
+        laid = loop_work.laid_over(entry, given, target, resume)
+        entry = replace(entry, options={**entry.options, **laid})
         with open_rig(entry) as device, interruptible(stop):
-            steps = loop_work.RigSteps(device, target, heed)
+            steps = loop_work.RigSteps(device, target, heed, rig_options=laid)
             name = resume or new_name(first.title)
             closed = loop_work.turn(
                 name, first, Shown(steps, quiet), target, Budget(rounds, minutes), tell
@@ -122,8 +130,11 @@ def close_loop(
         if steps.last is not None:
             show_diagnosis(steps.last)
         show_rounds(closed)
-        if sealed:
-            show_truth(truth(entry.options))
+        if laid.get("effects") == "sealed":
+            if closed.rounds:
+                show_truth(truth(entry.options))
+            else:
+                out.print("what is sealed stays so: no verdict stands yet", markup=False)
     if closed.ending not in ("traced", "adequate"):
         raise typer.Exit(1)
 

@@ -6,7 +6,7 @@ import { reportLinks } from "./identification.js";
 const ENDINGS = {
   traced: ["good", "Traced: what the model lacked is found."],
   adequate: ["good", "Adequate: the declared model explains the data to within noise."],
-  no_proposal: ["warn", "Open: no further experiment would tell more."],
+  no_proposal: ["warn", "Open: the diagnosis proposes no further experiment."],
   out_of_budget: ["warn", "Open: rounds or rig time are used up."],
   stopped: ["bad", "Stopped."],
 };
