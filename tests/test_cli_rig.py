@@ -2,8 +2,11 @@
 
 import json
 from pathlib import Path
+from shutil import copytree
 
+import numpy as np
 import pytest
+from scipy.io import wavfile
 
 from tests.test_cli_data import entrain, home  # noqa: F401  (a fixture)
 
@@ -70,6 +73,26 @@ def test_design_writes_a_plan_that_a_campaign_takes(
     assert [row["kind"] for row in json.loads(out)["conditions"]] == ["free"] + 3 * ["forced"]
 
 
+def test_a_design_keeps_away_from_a_run_that_was_excluded(
+    home: Path,  # noqa: F811
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The run at 168 Hz is clipped for the most part; 168.5 Hz had been proposed then."""
+    folder = copytree(Path(__file__).parent / "data" / "a-clean", home / "spoilt")
+    spoilt = folder / "runs" / "03_168Hz.wav"
+    rate, samples = wavfile.read(spoilt)
+    most = np.array([np.ptp(samples[:, 0]) // 8, 2**15 - 1, 2**15 - 1])
+    wavfile.write(spoilt, rate, np.clip(samples, -most, most).astype(samples.dtype))
+    words = ("campaign", "design", folder, "--out", "best.json", "--runs", "4")
+    code, out, err = entrain(capfd, *words)
+    assert (code, err) == (0, "")
+    plan = json.loads((home / "best.json").read_text("utf-8"))
+    places = [row["frequency_hz"] for row in plan["conditions"]]
+    assert len(places) == 4
+    assert all(abs(f / 168.0 - 1) >= 0.004 for f in places), places
+    assert "add the new ones to its folder" in out
+
+
 def test_check_finds_the_simulated_rig_fit(
     home: Path,  # noqa: F811
     capfd: pytest.CaptureFixture[str],
@@ -103,8 +126,6 @@ def test_what_is_not_possible_says_so(
 
 
 def test_characterise_a_plain_sine(home: Path, capfd: pytest.CaptureFixture[str]) -> None:  # noqa: F811
-    import numpy as np
-
     time = np.arange(20_000) / 2000.0
     noise = 0.01 * np.random.default_rng(1).standard_normal(time.size)
     np.savetxt(home / "sine.txt", np.column_stack([time, np.sin(2 * np.pi * 100 * time) + noise]))

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from daq.service import designing
 from daq.service.settings import RigSettings
 from simulated_rig.build import build_rig
 from tests.service_live import Running, running
+from tests.test_service_campaigns import ended, until
 
 DATA = Path(__file__).parent / "data" / "b-flame-delay"
 
@@ -90,6 +92,75 @@ def test_rivals_are_told_apart_where_they_differ(server: Running, known: str) ->
     wrong = replace(plan, design=replace(plan.design, rivals=("declared", "gremlin")))
     with pytest.raises(InputError, match="'gremlin' is not one of"):
         designing.resolved(wrong, server.service.store)
+
+
+def test_a_loop_over_rest_begins_with_a_designs_conditions(server: Running, known: str) -> None:
+    plan = {"record_s": 0.5, "design": {"campaign": known, "runs": 2}}
+    with server.client() as client:
+        # a free run is 3.5 s, each of the two conditions 6.5 s: without these it would begin
+        body = {"rig": "delayed", "plan": plan, "rig_minutes": 0.25}
+        job = client.post("/close-loops", json=body).json()
+        done = until(client, job["id"], ended)
+        assert done["state"] == "succeeded", done["error"]
+        result = client.get(f"/jobs/{job['id']}/result").json()
+    assert (result["ending"], result["rounds"]) == ("out_of_budget", [])
+    assert "needs about 0.3 min" in result["reason"]
+
+
+def proposal(forced: int, cold: int) -> SimpleNamespace:
+    """A diagnosis whose next experiment has so many runs of a second, the cold ones last."""
+    place = {"frequency_hz": 170.0, "amplitude_v": 1.0}
+    rows = [{**place, "kind": kind, "record_s": 1.0, "for": "discrimination"}
+            for kind in ["forced"] * forced + ["cold"] * cold]  # fmt: skip
+    plan = {"conditions": [place] * forced, "cold": [place] * cold, "record_s": 1.0}
+    return SimpleNamespace(to_json=lambda: {"next_experiment": {"conditions": rows, "plan": plan}})
+
+
+@pytest.mark.parametrize(
+    ("limits", "forced", "cold"),
+    [
+        ({}, 3, 2),
+        ({"runs": 4}, 3, 1),
+        ({"runs": 2}, 2, 0),
+        # a free run is 4 s, a forced one 7 s, a cold one 5.5 s
+        ({"minutes": 31 / 60}, 3, 1),
+        ({"minutes": 30 / 60}, 3, 0),
+        ({"minutes": 30 / 60, "runs": 1}, 1, 0),
+    ],
+)
+def test_what_a_diagnosis_proposes_is_cut_to_the_runs_and_minutes_of_the_design(
+    server: Running,
+    known: str,
+    monkeypatch: pytest.MonkeyPatch,
+    limits: dict[str, Any],
+    forced: int,
+    cold: int,
+) -> None:
+    monkeypatch.setattr(designing, "diagnose", lambda campaign, progress: proposal(3, 2))
+    table = {"campaign": known, "aim": "discrimination", **limits}
+    found = designing.resolved(parse_plan({"design": table}), server.service.store)
+    assert (len(found.conditions), len(found.cold)) == (forced, cold)
+
+
+def test_a_diagnosis_without_a_proposal_says_why(
+    server: Running, known: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = {"next_experiment": None, "explanation": "Without run 3 it explains all others."}
+    silent = SimpleNamespace(to_json=lambda: found)
+    monkeypatch.setattr(designing, "diagnose", lambda campaign, progress: silent)
+    plan = parse_plan({"design": {"campaign": known, "aim": "discrimination"}})
+    with pytest.raises(InputError, match=r"proposes no experiment\. Without run 3"):
+        designing.resolved(plan, server.service.store)
+
+
+def test_rivals_that_no_run_tells_apart_in_the_minutes_of_the_design(
+    server: Running, known: str
+) -> None:
+    """The least that can be done is a free run and a forced one of two seconds: 13 s."""
+    table = {"campaign": known, "aim": "discrimination", "rivals": ["declared", "flame_delay"],
+             "minutes": 0.2}  # fmt: skip
+    with pytest.raises(InputError, match="allow more runs or minutes"):
+        designing.resolved(parse_plan({"design": table}), server.service.store)
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,11 @@ tell the named rivals apart. `expected_precision` says what a plan's runs would 
 parameter's standard error, beside the runs of the campaign that it is designed from or continues.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from daq.designed import Design
 from daq.errors import InputError
 from daq.plan import Condition, Plan
 from daq.schedule import expand
@@ -19,7 +20,7 @@ from identify.diagnosis import diagnose
 from identify.fit import Fit
 from identify.identification import Prepared, identify, prepare
 from identify.load import load_campaign
-from identify.reach import Option, Reach, reach_of
+from identify.reach import Cost, Option, Reach, reach_of
 from identify.record import Campaign, DeclaredModel
 from identify.structure import Structure
 
@@ -45,7 +46,7 @@ def resolved(plan: Plan, store: RunStore, progress: Progress | None = None) -> P
         )
     except ValueError as error:
         raise InputError(f"design: campaign {wanted.campaign!r}: {error}") from error
-    if told is None or not (told["conditions"] or told["cold"]):
+    if not (told["conditions"] or told["cold"]):
         raise InputError(
             f"design: nothing within the limits of campaign {wanted.campaign!r} would tell more: "
             "allow more runs or minutes, or list conditions"
@@ -72,7 +73,7 @@ def expected_precision(plan: Plan, store: RunStore) -> list[dict[str, Any]]:
     fit, ready = _fitted(campaign)
     if not fit.converged:
         return []
-    options = _options(plan, reach_of(campaign, ready.measured, ready.data.free_hz))
+    options = _options(plan, reach_in(ready))
     after = design.expected_estimates(fit, ready, design.Chosen(options))
     return [
         {
@@ -93,6 +94,11 @@ def _campaign(plan: Plan, store: RunStore) -> Campaign:
     if plan.design is not None and plan.design.model is not None:
         campaign = replace(campaign, declared_model=DeclaredModel(**plan.design.model))
     return campaign
+
+
+def reach_in(ready: Prepared) -> Reach:
+    """What the rig of a campaign can do; nothing near runs that the quality gate has excluded."""
+    return reach_of(ready.campaign, ready.measured, ready.data.free_hz, ready.quality.excluded)
 
 
 _LAST: list[tuple[str, Fit, Prepared]] = []
@@ -117,7 +123,7 @@ def _sharpened(plan: Plan, campaign: Campaign, progress: Progress | None) -> dic
     chosen = design.sharpen(
         fit,
         ready,
-        reach_of(campaign, ready.measured, ready.data.free_hz, ready.quality.excluded),
+        reach_in(ready),
         record_s=plan.record_s,
         runs=plan.design.runs,
         budget_s=float("inf") if plan.design.minutes is None else 60 * plan.design.minutes,
@@ -125,20 +131,48 @@ def _sharpened(plan: Plan, campaign: Campaign, progress: Progress | None) -> dic
     return design.plan_of(chosen, ready, plan.title, plan.record_s, design.continued(campaign))
 
 
-def _told_apart(plan: Plan, campaign: Campaign, progress: Progress | None) -> dict[str, Any] | None:
+def _told_apart(plan: Plan, campaign: Campaign, progress: Progress | None) -> dict[str, Any]:
     assert plan.design is not None
     if not plan.design.rivals:
-        found = (diagnose(campaign, progress=progress).to_json()["next_experiment"] or {}).get(
-            "plan"
-        )
-        return dict(found) if found else None
+        found = diagnose(campaign, progress=progress).to_json()
+        if found["next_experiment"] is None:
+            raise ValueError(f"its diagnosis proposes no experiment. {found['explanation']}")
+        return _proposed(found["next_experiment"], plan.design)
     ready = prepare(campaign)
     rivals = [_rival(name, ready) for name in plan.design.rivals]
-    chosen = design.tell_apart(
-        rivals, ready, reach_of(campaign, ready.measured, ready.data.free_hz)
-    )
-    record_s = chosen.options[0].record_s if chosen.options else plan.record_s
+    reach = reach_in(ready)
+    told = design.tell_apart(rivals, ready, reach).options
+    chosen = design.Chosen(_within(told, plan.design, reach.cost))
+    record_s = told[0].record_s if told else plan.record_s
     return design.plan_of(chosen, ready, plan.title, record_s, design.continued(campaign))
+
+
+def _proposed(found: dict[str, Any], wanted: Design) -> dict[str, Any]:
+    """The plan of a diagnosis's next experiment, its first conditions only where few are wanted."""
+    names = ("kind", "record_s", "frequency_hz", "amplitude_v")
+    told = [Option(**{name: row[name] for name in names}) for row in found["conditions"]]
+    kinds = [option.kind for option in _within(told, wanted, Cost())]
+    plan = found["plan"]
+    return {
+        **plan,
+        "conditions": plan["conditions"][: kinds.count("forced")],
+        "cold": plan["cold"][: kinds.count("cold")],
+    }
+
+
+def _within(options: Sequence[Option], wanted: Design, cost: Cost) -> tuple[Option, ...]:
+    """The first of the options that the design's runs and minutes have room for, after the free
+    run. They come in the order of choice, each the most telling beside those before it, so that
+    the first ones are what would have been chosen of so many."""
+    left = float("inf") if wanted.minutes is None else 60 * wanted.minutes
+    kept: list[Option] = []
+    for option in options[: wanted.runs]:
+        free = [] if kept else [Option("free", option.record_s)]
+        left -= sum(map(cost.seconds, [*free, option]))
+        if left < 0:
+            break
+        kept.append(option)
+    return tuple(kept)
 
 
 def _rival(name: str, ready: Prepared) -> design.Rival:

@@ -19,9 +19,9 @@ def design(
     store: StoreOption = None,
 ) -> None:
     """Choose the conditions that tell most about the declared model's parameters (D-optimal)."""
+    from daq.service.designing import reach_in
     from identify import design as choice
     from identify.identification import identify, prepare
-    from identify.reach import reach_of
 
     recorded, _ = load(campaign, store)
     quiet = str(plan) == "-"
@@ -32,7 +32,7 @@ def design(
         out.print(f"the fit did not converge: {fit.reason}", markup=False)
         raise typer.Exit(1)
     ready = prepare(recorded)
-    reach = reach_of(recorded, ready.measured, ready.data.free_hz)
+    reach = reach_in(ready)
     budget = float("inf") if minutes is None else 60 * minutes
     chosen = choice.sharpen(fit, ready, reach, runs=runs, budget_s=budget)
     if not chosen.options:
@@ -70,3 +70,9 @@ def design(
             markup=False,
         )
     out.print(f"wrote {plan}; `entrain campaign run {plan}` measures it", markup=False)
+    if "continues" not in told:
+        out.print(
+            "this campaign was recorded elsewhere: for one analysis of all runs, add the new ones "
+            "to its folder",
+            markup=False,
+        )
