@@ -11,6 +11,7 @@ import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def read_hdf5(path: Path, wanted: Sequence[str] = ()) -> Recording:
 
             recording = _assemble(path, shapes, load, wanted)
             if recording.sample_rate_hz is None and rates:
-                return Recording(recording.samples, rates[0], None, recording.names)
+                return replace(recording, sample_rate_hz=rates[0])
             return recording
     except (OSError, KeyError, RuntimeError, ValueError) as error:
         if isinstance(error, InputError):
@@ -141,7 +142,8 @@ def _assemble(
     ]
     names = tuple(chosen) if all(column.shape[1] == 1 for column in columns) else ()
     samples = columns[0] if len(columns) == 1 else np.concatenate(columns, axis=1)
-    return Recording(samples, rates[0] if rates else None, None, names)
+    rate = rates[0] if rates else None
+    return Recording(samples, rate, names=names, picked=bool(wanted) and not missing)
 
 
 def _is_table(shape: tuple[int, ...]) -> bool:

@@ -26,13 +26,15 @@ class Recording:
     `samples` has shape (frames, channels), in the file's own numbers. `counts_full_scale` is the
     number that stands for the converter's full scale (32768 for int16 WAV, 1 for float WAV); None:
     the samples are volts. `sample_rate_hz` is None where the format does not say. `names` are the
-    columns' names where the file has any.
+    columns' names where the file has any. `picked`: the columns are those that were wanted by name,
+    in that order; otherwise all of the file's, in its own.
     """
 
     samples: npt.NDArray[Any]
     sample_rate_hz: float | None = None
     counts_full_scale: float | None = None
     names: tuple[str, ...] = ()
+    picked: bool = False
 
     def volts_per_count(self, full_scale_v: float) -> float:
         """The factor from the file's numbers to volts."""
@@ -61,8 +63,10 @@ def read_recording(path: Path, wanted: Sequence[str] = ()) -> Recording:
     Parameters
     ----------
     wanted
-        For formats with named variables, the variables in column order; empty: the one
+        For formats with named columns or variables, those in column order; empty: the one
         two-dimensional array, or all one-dimensional ones of equal length in the file's order.
+        Text, WAV and the one two-dimensional array are read whole where they lack the names:
+        `require_picked` refuses that.
 
     Raises
     ------
@@ -85,6 +89,21 @@ def read_recording(path: Path, wanted: Sequence[str] = ()) -> Recording:
     if recording.samples.shape[0] == 0 or recording.samples.shape[1] == 0:
         raise InputError(f"{path}: holds no samples")
     return recording
+
+
+def require_picked(path: Path, recording: Recording, wanted: Sequence[str]) -> None:
+    """Refuse a recording without the columns wanted by name; raises `InputError`."""
+    if recording.picked:
+        return
+    for name in wanted:
+        if not recording.names:
+            raise InputError(
+                f"{path}: no column {name!r}: its columns have no names: give numbers from 0"
+            )
+        if name not in recording.names:
+            raise InputError(f"{path}: no column {name!r}; there are {', '.join(recording.names)}")
+        if (count := recording.names.count(name)) > 1:
+            raise InputError(f"{path}: {count} columns are named {name!r}: rename them")
 
 
 def require_size(path: Path, what: str, size: int) -> None:

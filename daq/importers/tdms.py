@@ -45,7 +45,8 @@ def read_tdms(path: Path, wanted: Sequence[str] = ()) -> Recording:
         raise InputError(f"{path}: holds channels that are not real numbers")
     step = steps.pop() if len(steps) == 1 else None
     rate = 1.0 / float(step) if step else None
-    return Recording(np.stack(columns, axis=1), rate, None, tuple(chosen))
+    samples = np.stack(columns, axis=1)
+    return Recording(samples, rate, names=tuple(chosen), picked=bool(wanted))
 
 
 def _find(path: Path, names: list[str], wanted: str) -> str:

@@ -23,7 +23,19 @@ _MAX_LINE = 1 << 16
 
 
 def read_text(path: Path, wanted: Sequence[str] = ()) -> Recording:
-    """Read a table; `wanted` picks columns by name where there is a line of names."""
+    """Read a recording; `wanted` picks columns where the line of names has each of them once."""
+    table, names = read_table(path)
+    return _pick(path, table, names, wanted)
+
+
+def read_table(path: Path) -> tuple[npt.NDArray[np.float64], tuple[str, ...]]:
+    """The numbers, (rows, columns), and the columns' names where there is a line of them.
+
+    Raises
+    ------
+    InputError
+        Naming the line that is no part of a table, how many columns it has, and what to do.
+    """
     size = path.stat().st_size
     if size > MAX_BYTES // 8:
         raise InputError(
@@ -41,10 +53,10 @@ def read_text(path: Path, wanted: Sequence[str] = ()) -> Recording:
     body = text[head:]
     if separator in (";", "\t") and "," in body[:4096]:
         body = body.replace(",", ".")
-    table = _parse(path, body, separator)
+    table = _parse(path, body, separator, first_line=text.count("\n", 0, head) + 1)
     if names and len(names) != table.shape[1]:
         raise InputError(f"{path}: {len(names)} names for {table.shape[1]} columns")
-    return _pick(path, table, names, wanted)
+    return table, names
 
 
 def _layout(path: Path, text: str) -> tuple[int, tuple[str, ...], str | None]:
@@ -64,7 +76,10 @@ def _layout(path: Path, text: str) -> tuple[int, tuple[str, ...], str | None]:
                 raise InputError(f"{path}: neither names nor numbers: {stripped[:60]!r}")
             names = tuple(field.strip("\"' ") for field in fields)
         position += len(line)
-    raise InputError(f"{path}: no line of numbers")
+    what = "no line of numbers" if text.strip() else "no line of numbers, the file is empty"
+    raise InputError(
+        f"{path}: {what}; a table has one sample a line and one column a channel: export it again"
+    )
 
 
 def _separator(line: str) -> str | None:
@@ -79,20 +94,39 @@ def _fields(line: str, separator: str | None) -> list[str]:
     return fields[:-1] if fields[-1] == "" else fields
 
 
-def _parse(path: Path, body: str, separator: str | None) -> npt.NDArray[np.float64]:
+def _parse(
+    path: Path, body: str, separator: str | None, first_line: int
+) -> npt.NDArray[np.float64]:
     first = next(line for line in io.StringIO(body) if line.strip() and line.strip()[0] != "#")
-    columns = len(_fields(first.strip(), separator))
-    trailing = separator is not None and first.strip(" \r\n").endswith(separator)
+    if separator is not None and first.strip(" \r\n").endswith(separator):
+        body = re.sub(rf"(?<=[^\n]){separator}[ \r]*$", "", body, flags=re.MULTILINE)
     try:
-        table = np.loadtxt(
-            io.StringIO(body),
-            delimiter=separator,
-            ndmin=2,
-            usecols=range(columns) if trailing else None,
-        )
-    except (ValueError, IndexError) as error:
-        raise InputError(f"{path}: not a table of numbers: {error}") from error
+        table = np.loadtxt(io.StringIO(body), delimiter=separator, ndmin=2)
+    except ValueError as error:
+        columns = len(_fields(first.strip(), separator))
+        fault = _fault(body, separator, columns, first_line) or f"not a table of numbers ({error})"
+        raise InputError(f"{path}: {fault}") from error
     return np.asarray(table, dtype=np.float64)
+
+
+def _fault(body: str, separator: str | None, columns: int, first_line: int) -> str | None:
+    """What is wrong with the first line that does not fit into the table, and what to do."""
+    for number, line in enumerate(io.StringIO(body), start=first_line):
+        content = line.partition("#")[0].strip()
+        fields = [field.strip() for field in content.split(separator)]
+        if content and len(fields) != columns:
+            return (
+                f"line {number} has {len(fields)} columns where {columns} were expected, as in the "
+                "first line of numbers; give every line as many, or cut the file there"
+            )
+        for field in fields if content else ():
+            try:
+                float(field)
+            except ValueError:
+                return (
+                    f"line {number}: {field!r} is not a number; correct it, or cut the file there"
+                )
+    return None
 
 
 def _pick(
@@ -105,10 +139,11 @@ def _pick(
     if names and _TIME.match(names[0]) and table.shape[1] > 1:
         rate = _rate(path, table[:, 0])
         table, names = table[:, 1:], names[1:]
-    if wanted and names and set(wanted) <= set(names):
+    picked = bool(wanted) and all(names.count(name) == 1 for name in wanted)
+    if picked:
         table = table[:, [names.index(name) for name in wanted]]
         names = tuple(wanted)
-    return Recording(np.ascontiguousarray(table), rate, None, names)
+    return Recording(np.ascontiguousarray(table), rate, names=names, picked=picked)
 
 
 def _rate(path: Path, time: npt.NDArray[np.float64]) -> float | None:

@@ -18,7 +18,7 @@ _PCM, _FLOAT, _EXTENSIBLE = 1, 3, 0xFFFE
 
 
 def read_wav(path: Path, wanted: Sequence[str] = ()) -> Recording:
-    """Read a WAV file; `wanted` is ignored, since its columns have no names."""
+    """Read a WAV file; `wanted` is never `picked`, since its columns have no names."""
     size = path.stat().st_size
     chunks = _chunks(path, size)
     if "fmt " not in chunks or "data" not in chunks:
