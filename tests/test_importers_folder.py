@@ -1,14 +1,20 @@
 """Campaign folders: what is read is what was written, and what cannot be used is refused."""
 
 import re
-from collections.abc import Callable
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from daq.errors import InputError, UnknownItem
-from daq.importers import import_folder, open_campaign
+from daq.errors import InputError, StoreError, UnknownItem
+from daq.importers import Recording, folder, import_folder, open_campaign, read_recording, whole
+from daq.records import CampaignCard
 from daq.store import RunStore
 from identify.load import LoadError, load_campaign
 from tests.daq_folders import CHANNELS, int16, tones, write_folder, write_wav
@@ -69,6 +75,77 @@ def test_importing_again_finds_the_first(tmp_path: Path, store: RunStore) -> Non
     write_wav(folder / "runs/f166.wav", int16(tones(166.0, 1.25)))
     assert import_folder(folder, store).id != first.id
     assert len(store.campaigns()) == 2
+
+
+def _at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, patience_s: float
+) -> tuple[CampaignCard, Future[CampaignCard]]:
+    """Two imports of one folder: the first stands still while it reads its third recording, until
+    the second has ended, or has not within `patience_s`."""
+    path = write_folder(tmp_path / "small")
+    half, go_on = threading.Event(), threading.Event()
+
+    def reading(file: Path, wanted: Sequence[str] = ()) -> Recording:
+        if file.name == "f172.wav" and not half.is_set():
+            half.set()
+            assert go_on.wait(30)
+        return read_recording(file, wanted)
+
+    monkeypatch.setattr(folder, "read_recording", reading)
+    with ThreadPoolExecutor(2) as workers:
+        first = workers.submit(import_folder, path, RunStore(tmp_path / "store"))
+        assert half.wait(20)
+        second = workers.submit(import_folder, path, RunStore(tmp_path / "store"))
+        wait([second], patience_s)
+        go_on.set()
+    return first.result(), second
+
+
+def test_two_imports_at_once_make_one_campaign(
+    tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second had removed what the first was writing, and then what it had written."""
+    first, second = _at_once(tmp_path, monkeypatch, 0.3)
+    assert second.result() == first
+    assert len(store.campaign_runs(first.id)) == len(store.runs()) == 4
+    assert [path.name for path in store.campaigns_dir.iterdir()] == [first.id]
+    assert not list(store.root.glob(".*importing"))
+
+
+def test_an_import_that_takes_long_refuses_another(
+    tmp_path: Path, store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(whole, "WAIT_S", 0.0)
+    first, second = _at_once(tmp_path, monkeypatch, 20.0)
+    with pytest.raises(StoreError, match="is being imported by another process; try again"):
+        second.result()
+    assert store.card(first.id).status == "complete"
+    assert len(store.campaign_runs(first.id)) == 4
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="no SIGKILL here")
+def test_an_import_that_was_killed_blocks_nobody(tmp_path: Path, store: RunStore) -> None:
+    path = write_folder(tmp_path / "small")
+    code = """
+import os, signal, sys
+from pathlib import Path
+from daq.importers import folder
+from daq.store import RunStore
+read = folder.read_recording
+def killed(file, wanted=()):
+    if file.name == "f172.wav":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return read(file, wanted)
+folder.read_recording = killed
+folder.import_folder(Path(sys.argv[1]), RunStore(sys.argv[2]))
+"""
+    done = subprocess.run([sys.executable, "-c", code, str(path), str(store.root)])
+    assert done.returncode == -signal.SIGKILL
+    assert [row.status for row in store.campaigns()] == ["importing"]
+    assert list(store.root.glob(".*importing"))
+    card = import_folder(path, store)
+    assert (card.status, len(store.campaign_runs(card.id))) == ("complete", 4)
+    assert not list(store.root.glob(".*importing"))
 
 
 def test_defaults_of_medium_and_model(tmp_path: Path, store: RunStore) -> None:
@@ -153,6 +230,10 @@ BAD = {
         r"'p1': unit='mPa' is not SI; give unit 'Pa' and volts_per_unit=2$",
     ),
     "decibels": (_edit('"Pa"', '"dB"'), "'p1': unit='dB' is no unit of samples"),
+    "a broadband recording": (
+        _edit(r"\[\[channels\]\]", '[excitation]\nkind = "broadband"\n[[channels]]'),
+        r"only `entrain diagnose` takes a folder with \[excitation\]",
+    ),
     "twice p1": (_edit('"p2"', '"p1"'), "named twice: p1"),
     "unknown kind": (_edit('"free"', '"warm"'), r"runs\[0\]\.kind='warm'"),
     "unknown suffix": (

@@ -1,10 +1,11 @@
 """Recordings that cannot be identified from are refused on their way in, with what and where.
 
 Refused: samples that are not finite, a channel that is constant (a cable that is not plugged in),
-a drive that is silent in a forced run. Clipping and noise are not refused: they are flags of
-quality, judged where the record is used.
+a drive that is silent in a forced run, a forced run whose frequency is not known. Clipping and
+noise are not refused: they are flags of quality, judged where the record is used.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,28 @@ import numpy.typing as npt
 from daq.errors import InputError
 from daq.records import Kind
 from drivers.types import Channel
+
+
+def require_forcing(
+    where: str,
+    kind: Kind,
+    frequency_hz: float | None,
+    amplitude_v: float | None,
+    sample_rate_hz: float,
+) -> None:
+    """What is declared of a run's forcing can be; raises `InputError`."""
+    if frequency_hz is None:
+        if kind == "forced":
+            raise InputError(f"{where}: a forced run needs frequency_hz")
+    elif not (math.isfinite(frequency_hz) and frequency_hz > 0):
+        raise InputError(f"{where}: frequency_hz={frequency_hz} is not a finite frequency > 0")
+    elif frequency_hz >= sample_rate_hz / 2:
+        raise InputError(
+            f"{where}: frequency_hz={frequency_hz} is not below half the sample rate, "
+            f"{sample_rate_hz / 2:g} Hz"
+        )
+    if amplitude_v is not None and not (math.isfinite(amplitude_v) and amplitude_v >= 0):
+        raise InputError(f"{where}: amplitude_v={amplitude_v} is not a finite amplitude >= 0")
 
 
 @dataclass

@@ -8,14 +8,16 @@ imported again is found, and a changed one becomes another campaign.
 import hashlib
 import shutil
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from daq.errors import InputError
-from daq.importers.checks import SampleCheck
-from daq.importers.recording import Recording, read_recording
+from daq.importers.checks import SampleCheck, require_forcing
+from daq.importers.recording import Recording, read_recording, require_picked
+from daq.importers.whole import all_or_nothing, alone
 from daq.records import CampaignCard, Kind, Role, RunHeader, RunSummary
 from daq.store import RunStore, slug, utc_now
 from drivers.errors import SettingError
@@ -49,7 +51,7 @@ class DeclaredModelTable(Strict):
 
 
 class ChannelTable(Strict):
-    """One column of every recording; `variable` names it in formats of named arrays."""
+    """One column of every recording; `variable` names it in files whose columns have names."""
 
     name: str = Field(min_length=1, pattern=r"^[^/\x00]+$")
     quantity: Quantity
@@ -106,24 +108,22 @@ def import_folder(folder: Path, store: RunStore) -> CampaignCard:
     ------
     InputError
         Naming the file, the run and the key, value or sample that is not usable.
+    StoreError
+        Another process is still importing the same folder, or the store cannot be written.
     """
     folder = folder.expanduser()
     description = read_description(folder / "campaign.toml")
     files = [inside(folder, run.file) for run in description.runs]
     identifier = f"{slug(folder.resolve().name)}-{_digest([folder / 'campaign.toml', *files])}"
     existing = store.campaigns_dir / identifier
-    if existing.exists():
-        if (existing / "campaign.json").exists():
-            card = store.card(identifier)
-            if card.status == "complete":
-                return card
-        shutil.rmtree(existing)  # an import that was killed half way
-    try:
+    with alone(store, identifier):
+        if existing.exists():
+            if (existing / "campaign.json").exists():
+                card = store.card(identifier)
+                if card.status == "complete":
+                    return card
+            shutil.rmtree(existing)  # an import that was killed half way: nobody works on it now
         return _import(folder, description, files, identifier, store)
-    except BaseException:
-        shutil.rmtree(existing, ignore_errors=True)
-        store.catalogue.forget(identifier)
-        raise
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -144,6 +144,11 @@ def read_toml(path: Path) -> dict[str, Any]:
 def read_description(path: Path) -> CampaignToml:
     """Parse and check a `campaign.toml`; raises `InputError`."""
     content = read_toml(path)
+    if "excitation" in content:
+        raise InputError(
+            f"{path}: only `entrain diagnose` takes a folder with [excitation] (one broadband "
+            "recording); everything else needs [[runs]]"
+        )
     try:
         description = CampaignToml.model_validate(content)
     except ValidationError as error:
@@ -185,14 +190,9 @@ def _require_consistent(path: Path, description: CampaignToml) -> None:
             raise InputError(f"{where}: two runs of the name {Path(run.file).stem!r}")
         if run.kind == "forced":
             forced += 1
-            if run.frequency_hz is None:
-                raise InputError(f"{where}: a forced run needs frequency_hz")
-        nyquist = description.sample_rate_hz / 2
-        if run.frequency_hz is not None and run.frequency_hz >= nyquist:
-            raise InputError(
-                f"{where}: frequency_hz={run.frequency_hz} is not below half the sample rate, "
-                f"{nyquist:g} Hz"
-            )
+        require_forcing(
+            where, run.kind, run.frequency_hz, run.amplitude_v, description.sample_rate_hz
+        )
     if forced == 0:
         raise InputError(f"{path}: no forced run: identification needs at least one")
     if "drive" not in names:
@@ -214,26 +214,25 @@ def _import(
         source=str(folder.resolve()),
         status="importing",
     )
-    summaries = []
-    for index, (run, path) in enumerate(zip(description.runs, files, strict=True)):
-        recording = read_recording(path, _wanted(description))
-        require_match(path, recording, len(description.channels), description.sample_rate_hz)
-        header = RunHeader(
-            name=f"{index:03d}-{slug(path.stem)}",
-            kind=run.kind,
-            sample_rate_hz=description.sample_rate_hz,
-            channels=tuple(channel.channel() for channel in description.channels),
-            **encoding(recording, [c.full_scale_v for c in description.channels]),
-            frequency_hz=None if run.kind == "free" else run.frequency_hz,
-            amplitude_v=None if run.kind == "free" else run.amplitude_v,
-            started_s=run.started_s,
-            started_at=utc_now(),
-            role=run.role,
-            notes={"imported_from": run.file},
-        )
-        summaries.append(write_recording(store, identifier, header, recording, str(path)))
-    store.catalogue.add_runs(summaries)
-    store.set_status(identifier, status="complete")
+    with all_or_nothing(store, card.id):
+        summaries = []
+        for index, (run, path) in enumerate(zip(description.runs, files, strict=True)):
+            recording = read_columns(path, description.channels, description.sample_rate_hz)
+            header = RunHeader(
+                name=f"{index:03d}-{slug(path.stem)}",
+                kind=run.kind,
+                sample_rate_hz=description.sample_rate_hz,
+                channels=tuple(channel.channel() for channel in description.channels),
+                **encoding(recording, [c.full_scale_v for c in description.channels]),
+                frequency_hz=None if run.kind == "free" else run.frequency_hz,
+                amplitude_v=None if run.kind == "free" else run.amplitude_v,
+                started_s=run.started_s,
+                started_at=utc_now(),
+                role=run.role,
+                notes={"imported_from": run.file},
+            )
+            summaries.append(write_recording(store, identifier, header, recording, str(path)))
+        store.catalogue.add_runs(summaries)
     return store.card(card.id)
 
 
@@ -253,6 +252,20 @@ def write_recording(
         writer.discard()
         raise
     return writer.finish()
+
+
+def read_columns(path: Path, channels: Sequence[ChannelTable], rate_hz: float) -> Recording:
+    """A recording with a column a channel in the channels' order, sampled at `rate_hz`.
+
+    Where the file's columns have names, a declared `variable` must be among them; channels that
+    only have a name of their own are otherwise taken in the file's order.
+    """
+    wanted = [channel.variable or channel.name for channel in channels]
+    recording = read_recording(path, wanted)
+    if recording.names and any(channel.variable for channel in channels):
+        require_picked(path, recording, wanted)
+    require_match(path, recording, len(channels), rate_hz)
+    return recording
 
 
 def require_match(path: Path, recording: Recording, columns: int, rate_hz: float) -> None:
@@ -276,10 +289,6 @@ def encoding(recording: Recording, full_scales_v: list[float]) -> dict[str, Any]
         "dtype": kinds.get(f"{dtype.kind}{dtype.itemsize}", "float64"),
         "volts_per_count": tuple(recording.volts_per_count(v) for v in full_scales_v),
     }
-
-
-def _wanted(description: CampaignToml) -> list[str]:
-    return [channel.variable or channel.name for channel in description.channels]
 
 
 def inside(folder: Path, name: str) -> Path:
