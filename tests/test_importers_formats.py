@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from daq.errors import InputError
 from daq.exporters import export_folder, export_run
 from daq.importers import (
+    Recording,
     RecordingOptions,
     import_folder,
     import_recordings,
@@ -23,6 +24,7 @@ from daq.importers import (
     read_recording,
     recording,
 )
+from daq.importers.single import select
 from daq.store import RunStore
 from daq.store_file import open_run, read_volts
 from drivers.types import Channel
@@ -132,6 +134,82 @@ def test_columns_are_picked_by_name_and_number(tmp_path: Path, store: RunStore) 
         assert run.sample_rate_hz == pytest.approx(100.0)
     with pytest.raises(InputError, match="column 7 is not one of its 2"):
         import_recordings([tmp_path / "x.txt"], RecordingOptions((channel,), (7,)), store)
+
+
+PAIR = (Channel("a", "voltage", "V"), Channel("b", "voltage", "V"))
+
+
+def test_columns_asked_for_are_those_delivered(tmp_path: Path) -> None:
+    """A wrong name had been ignored, and the file's own order taken."""
+    csv, twice = tmp_path / "x.csv", tmp_path / "twice.csv"
+    csv.write_text("left,right\n1,2\n3,5\n")
+    twice.write_text("V,V\n1,2\n3,5\n")
+    write_wav(tmp_path / "x.wav", np.arange(8, dtype=np.int16).reshape(4, 2))
+    np.savez(tmp_path / "x.npz", table=np.arange(8.0).reshape(4, 2))
+
+    def picked(path: Path, *columns: int | str) -> Recording:
+        return select(path, RecordingOptions(PAIR, columns))
+
+    found = picked(csv, "right", "left")
+    assert found.names == ("right", "left")
+    np.testing.assert_array_equal(found.samples, [[2, 1], [5, 3]])
+    np.testing.assert_array_equal(picked(tmp_path / "x.wav", 1, 0).samples[0], [1, 0])
+    np.testing.assert_array_equal(picked(tmp_path / "x.npz", "table").samples[0], [0, 1])
+    with pytest.raises(InputError, match="no column 'rihgt'; there are left, right"):
+        picked(csv, "rihgt", "left")
+    with pytest.raises(InputError, match="2 columns are named 'V'"):
+        picked(twice, "V", "V")
+    for name in ("x.wav", "x.npz"):
+        with pytest.raises(InputError, match=r"its columns have no names: give numbers from 0"):
+            picked(tmp_path / name, "right", "left")
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (RecordingOptions(PAIR, kind="forced"), "a forced run needs frequency_hz"),
+        (
+            RecordingOptions(PAIR, kind="forced", frequency_hz=1000.0),
+            "frequency_hz=1000.0 is not below half the sample rate, 1000 Hz",
+        ),
+        (RecordingOptions(PAIR, kind="forced", frequency_hz=-1.0), "frequency_hz=-1.0"),
+        (RecordingOptions(PAIR, kind="cold", frequency_hz=50.0, amplitude_v=-1.0), "amplitude_v"),
+        (RecordingOptions(PAIR, frequency_hz=50.0), "frequency_hz=50.0 is not for a free run"),
+        (RecordingOptions(PAIR, sample_rate_hz=0.0), "sample_rate_hz=0"),
+        (RecordingOptions(PAIR[:1]), "2 columns for 1"),
+        (RecordingOptions(PAIR), "constant"),  # the second file: found while it is written
+    ],
+)
+def test_a_refused_recording_leaves_nothing(
+    options: RecordingOptions, says: str, tmp_path: Path, store: RunStore
+) -> None:
+    """A campaign had stayed behind that was never imported to its end."""
+    good = np.arange(200, dtype=np.int16).reshape(100, 2)
+    write_wav(tmp_path / "good.wav", good)
+    write_wav(tmp_path / "dead.wav", good * np.array([1, 0], dtype=np.int16))
+    with pytest.raises(InputError, match=says):
+        import_recordings([tmp_path / "good.wav", tmp_path / "dead.wav"], options, store)
+    assert store.campaigns() == []
+    assert store.runs() == []
+    assert list(store.campaigns_dir.iterdir()) == []
+
+
+def test_the_line_at_fault_is_named_in_our_words(tmp_path: Path) -> None:
+    """NumPy had advised `usecols`, and a value missing at the first line's end cost a column."""
+    path = tmp_path / "x.csv"
+    for text, says in (
+        ("", "no line of numbers, the file is empty; a table has"),
+        ("# nothing\n", "no line of numbers; a table has"),
+        ("# made here\na,b\n1,2\n\n3,4,5\n", "line 5 has 3 columns where 2 were expected"),
+        ("1,2\n3\n", "line 2 has 1 columns where 2 were expected"),
+        ("1,2,\n3,4,5\n", "line 2 has 3 columns where 2 were expected"),
+        ("1;2\n3;\n", "line 2: '' is not a number; correct it"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=says) as caught:
+            read_recording(path)
+        assert str(path) in str(caught.value)
+        assert "usecols" not in str(caught.value)
 
 
 def test_matlab_73_is_read_as_what_it_is(tmp_path: Path) -> None:

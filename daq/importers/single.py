@@ -9,8 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from daq.errors import InputError
+from daq.importers.checks import require_forcing
 from daq.importers.folder import encoding, require_match, write_recording
-from daq.importers.recording import Recording, read_recording
+from daq.importers.recording import Recording, read_recording, require_picked
+from daq.importers.whole import all_or_nothing, alone
 from daq.records import CampaignCard, Kind, RunHeader
 from daq.store import RunStore, slug, utc_now
 from drivers.types import Channel
@@ -46,31 +48,50 @@ def import_recordings(
     if not files:
         raise InputError("files=[] is not a list of one or more recordings")
     read = [(path, select(path, options)) for path in files]
-    card = store.create_campaign(
-        title or read[0][0].stem,
-        medium=options.medium,
-        source=str(read[0][0].resolve().parent),
-        status="importing",
-    )
-    for index, (path, recording) in enumerate(read):
-        rate = options.sample_rate_hz or recording.sample_rate_hz
-        if rate is None:
-            raise InputError(f"{path}: the file does not tell its sample rate: give sample_rate_hz")
-        require_match(path, recording, len(options.channels), rate)
-        header = RunHeader(
-            name=f"{index:03d}-{slug(path.stem)}",
-            kind=options.kind,
-            sample_rate_hz=rate,
-            channels=options.channels,
-            **encoding(recording, [channel.full_scale_v for channel in options.channels]),
-            frequency_hz=options.frequency_hz,
-            amplitude_v=options.amplitude_v,
-            started_at=utc_now(),
-            notes={"imported_from": str(path)},
+    headers = [
+        _header(index, path, recording, options) for index, (path, recording) in enumerate(read)
+    ]
+    title = title or files[0].stem
+    with alone(store, slug(title)):  # the id is new: no other import takes it in the same second
+        card = store.create_campaign(
+            title,
+            medium=options.medium,
+            source=str(files[0].resolve().parent),
+            status="importing",
         )
-        store.add_run(write_recording(store, card.id, header, recording, str(path)))
-    store.set_status(card.id, status="complete")
+    with all_or_nothing(store, card.id):
+        for (path, recording), header in zip(read, headers, strict=True):
+            store.add_run(write_recording(store, card.id, header, recording, str(path)))
     return store.card(card.id)
+
+
+def _header(index: int, path: Path, recording: Recording, options: RecordingOptions) -> RunHeader:
+    """The run's header; raises `InputError` for what the options say that the file cannot be."""
+    rate = options.sample_rate_hz
+    if rate is None:
+        rate = recording.sample_rate_hz
+    if rate is None:
+        raise InputError(f"{path}: the file does not tell its sample rate: give sample_rate_hz")
+    require_match(path, recording, len(options.channels), rate)
+    header = RunHeader(
+        name=f"{index:03d}-{slug(path.stem)}",
+        kind=options.kind,
+        sample_rate_hz=rate,
+        channels=options.channels,
+        **encoding(recording, [channel.full_scale_v for channel in options.channels]),
+        frequency_hz=options.frequency_hz,
+        amplitude_v=options.amplitude_v,
+        started_at=utc_now(),
+        notes={"imported_from": str(path)},
+    )
+    require_forcing(str(path), options.kind, options.frequency_hz, options.amplitude_v, rate)
+    for name in ("frequency_hz", "amplitude_v"):
+        value = getattr(options, name)
+        if options.kind == "free" and value is not None:
+            raise InputError(
+                f"{path}: {name}={value} is not for a free run: give kind=forced, or leave it out"
+            )
+    return header
 
 
 def select(path: Path, options: RecordingOptions) -> Recording:
@@ -81,6 +102,7 @@ def select(path: Path, options: RecordingOptions) -> Recording:
         raise InputError(f"columns={options.columns} mix numbers and names")
     recording = read_recording(path, names)
     if not numbers:
+        require_picked(path, recording, names)
         return recording
     width = recording.samples.shape[1]
     outside = [number for number in numbers if not 0 <= number < width]
