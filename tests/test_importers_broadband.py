@@ -64,6 +64,12 @@ def test_what_stands_in_the_folder_is_read(tmp_path: Path) -> None:
         ("period_samples = 512\n", "", "period_samples"),
         ('file = "recording.csv"', 'file = "../recording.csv"', "outside"),
         ("title", "mains = 50\ntitle", "mains"),
+        ("volts_per_unit = 0.5", "volts_per_unit = 0.0", "'response': volts_per_unit=0.0"),
+        ('unit = "Pa"', 'unit = "kPa"', "unit='kPa' is not SI; give unit 'Pa'"),
+        ("period_starts = [1100, 1700]\n", "", "period_samples=512 needs period_starts"),
+        ("[1100, 1700]", "[900, 1700]", r"period \[900, 1412\] is not within estimation"),
+        ("[1100, 1700]", "[1100, 3500]", r"period \[3500, 4012\] is not within estimation"),
+        ('variable = "y"', 'variable = "z"', "no column 'z'; there are y, u"),
     ],
 )
 def test_a_folder_that_cannot_be_used_says_why(
@@ -72,6 +78,19 @@ def test_a_folder_that_cannot_be_used_says_why(
     assert old in CARD
     with pytest.raises(InputError, match=says):
         read_broadband(folder(tmp_path, CARD.replace(old, new)))
+
+
+def test_the_recording_is_the_one_declared(tmp_path: Path) -> None:
+    """Sampled at the rate declared, and without columns that nobody declared."""
+    values = np.random.default_rng(1).standard_normal((4000, 3))
+    table = np.column_stack([np.arange(4000) / 500.0, values[:, :2]])
+    folder(tmp_path)
+    np.savetxt(tmp_path / "recording.csv", table, delimiter=",", header="time,y,u", comments="")
+    with pytest.raises(InputError, match=r"sampled at 500 Hz, but sample_rate_hz=600"):
+        read_broadband(tmp_path)
+    np.savetxt(tmp_path / "recording.csv", values, delimiter=",")
+    with pytest.raises(InputError, match="3 columns for 2 declared channels"):
+        read_broadband(tmp_path)
 
 
 def test_an_ordinary_folder_is_none(tmp_path: Path) -> None:

@@ -28,8 +28,8 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from daq.errors import InputError
-from daq.importers.folder import ChannelTable, Strict, explain, inside, read_toml
-from daq.importers.recording import read_recording
+from daq.importers.folder import ChannelTable, Strict, explain, inside, read_columns, read_toml
+from drivers.errors import SettingError
 
 Stretch = Annotated[list[int], Field(min_length=2, max_length=2)]
 Feedback = Literal["linear", "cubic", "cubic_quadratic"]
@@ -103,27 +103,31 @@ def read_broadband(path: str | Path) -> BroadbandRecord:
     toml = folder / "campaign.toml"
     try:
         card = BroadbandToml.model_validate(read_toml(toml))
+        channels = [c.channel() for c in card.channels]
     except ValidationError as error:
         raise InputError(f"{toml}: {explain(error)}") from error
+    except SettingError as error:
+        raise InputError(f"{toml}: {error}") from error
     names = [c.name for c in card.channels]
     if names.count("drive") != 1:
         raise InputError(f"{toml}: channels {names}: exactly one must be named 'drive'")
     table = card.excitation
     if table.period_starts and table.period_samples is None:
         raise InputError(f"{toml}: period_starts need period_samples, the length of a period")
-    recording = read_recording(
-        inside(folder, table.file), [c.variable or c.name for c in card.channels]
-    )
+    if table.period_samples is not None and not table.period_starts:
+        raise InputError(
+            f"{toml}: period_samples={table.period_samples} needs period_starts, the first sample "
+            "of each whole period"
+        )
+    recording = read_columns(inside(folder, table.file), card.channels, card.sample_rate_hz)
     samples = recording.samples
-    if samples.ndim != 2 or samples.shape[1] < 2:
-        raise InputError(f"{folder / table.file}: shape {samples.shape} is not (frames, 2)")
-    volts = [
+    signals = [
         np.asarray(samples[:, i], dtype=float)
         * recording.volts_per_count(c.full_scale_v)
         / c.volts_per_unit
-        for i, c in enumerate(card.channels)
+        for i, c in enumerate(channels)
     ]
-    for c, values in zip(card.channels, volts, strict=True):
+    for c, values in zip(channels, signals, strict=True):
         if not np.isfinite(values).all():
             raise InputError(f"{folder / table.file}: channel {c.name!r} holds NaN or infinity")
     drive = names.index("drive")
@@ -134,16 +138,24 @@ def read_broadband(path: str | Path) -> BroadbandRecord:
             raise InputError(f"{toml}: {key}={ends} is not within the {frames} samples recorded")
         return slice(ends[0], ends[1])
 
+    estimation = stretch("estimation", table.estimation)
+    period = table.period_samples or 0
+    for start in table.period_starts:
+        if not estimation.start <= start <= estimation.stop - period:
+            raise InputError(
+                f"{toml}: period_starts: the period [{start}, {start + period}] is not within "
+                f"estimation={table.estimation}"
+            )
     return BroadbandRecord(
         card.title,
         card.sample_rate_hz,
         card.declared_model.feedback,
-        volts[drive],
-        volts[1 - drive],
-        stretch("estimation", table.estimation),
+        signals[drive],
+        signals[1 - drive],
+        estimation,
         stretch("test", table.test),
         None if table.noise is None else stretch("noise", table.noise),
         table.period_samples,
         tuple(table.period_starts),
-        (card.channels[drive].unit, card.channels[1 - drive].unit),
+        (channels[drive].unit, channels[1 - drive].unit),
     )
