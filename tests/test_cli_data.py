@@ -52,6 +52,71 @@ def test_import_of_a_single_recording(home: Path, capfd: pytest.CaptureFixture[s
     assert "1 runs" in out
 
 
+def test_every_folder_given_is_imported(home: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Of two, the second had been passed over in silence."""
+    one, other = make_folder(home / "one"), make_folder(home / "other")
+    code, out, _ = entrain(capfd, "import", one, other)
+    assert (code, out.count("3 runs")) == (0, 2)
+    listed = entrain(capfd, "campaign", "list")[1]
+    assert "one-" in listed
+    assert "other-" in listed
+
+
+def test_what_does_not_apply_to_folders_is_refused(
+    home: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    folder = make_folder(home / "sines")
+    for words, says in (
+        (("--title", "x", "--rate-hz", "5"), "--title, --rate-hz: only for single recordings"),
+        (("--kind", "free"), "--kind: only for single recordings"),
+        ((folder / "free.wav",), "import folders and recordings separately"),
+        ((home / "absent",), "absent: no such file or folder"),
+    ):
+        code, out, err = entrain(capfd, "import", folder, *words)
+        assert (code, out) == (2, "")
+        assert says in err
+    assert "no campaigns" in entrain(capfd, "campaign", "list")[1]
+
+
+@pytest.mark.parametrize("title", ["Rig A [flame off], day 2", "odd [/x] title"])
+def test_titles_are_shown_as_they_are(
+    home: Path, capfd: pytest.CaptureFixture[str], title: str
+) -> None:
+    """They had been read as Rich's markup."""
+    recording = make_folder(home / "sines") / "free.wav"
+    channels = ("p1:pressure:Pa:0.01:0.7", "p2:pressure:Pa:0.01:0.8", "drive:voltage:V:1")
+    words = [word for text in channels for word in ("--channel", text)]
+    _, out, _ = entrain(capfd, "import", recording, "--title", title, *words)
+    code, out, _ = entrain(capfd, "campaign", "show", out.split()[1].rstrip(":"))
+    assert code == 0
+    assert title in out
+
+
+def test_files_left_out_are_shown_as_they_are(
+    home: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    damaged = home / "store [old]" / "campaigns" / "c" / "campaign.json"
+    damaged.parent.mkdir(parents=True)
+    damaged.write_text("{")
+    code, out, _ = entrain(capfd, "store", "rebuild", "--store", home / "store [old]")
+    assert code == 1
+    assert "store [old]" in out.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("", "no line of numbers, the file is empty"), ("1,2\n3\n", "line 2 has 1 columns where 2")],
+)
+def test_a_table_that_is_none_cannot_be_characterised(
+    home: Path, capfd: pytest.CaptureFixture[str], text: str, says: str
+) -> None:
+    (home / "x.csv").write_text(text)
+    code, out, err = entrain(capfd, "characterise", home / "x.csv", "--rate-hz", "100")
+    assert (code, out) == (2, "")
+    assert says in err
+    assert "loadtxt" not in err
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

@@ -1,5 +1,6 @@
 """The words by which single recordings are described, on the command line and over HTTP."""
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
@@ -8,6 +9,7 @@ import numpy as np
 
 from daq.errors import InputError
 from daq.importers import RecordingOptions, read_recording
+from daq.importers.text import read_table
 from daq.records import Kind
 from drivers.types import Channel, Quantity, require_si
 from identify.characterise import Recording, RecordingError, read_text
@@ -44,8 +46,11 @@ def read_unforced(path: Path, names: Sequence[str], rate_hz: float | None) -> Re
         raise InputError(f"{path}: no such file")
     if path.suffix.lower() in TEXT:
         try:
-            return read_text(path, names=names or None, sample_rate_hz=rate_hz)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # NumPy's own words on an empty file
+                return read_text(path, names=names or None, sample_rate_hz=rate_hz)
         except RecordingError as error:
+            read_table(path)  # says which line it is where the table itself is at fault
             raise InputError(str(error)) from error
     found = read_recording(path, names)
     rate = found.sample_rate_hz or rate_hz

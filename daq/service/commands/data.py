@@ -4,10 +4,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 
 from daq.service.commands.common import StoreOption, number, open_store, out, table
 
 if TYPE_CHECKING:
+    from daq.records import CampaignCard
+    from daq.store import RunStore
     from daq.store_upkeep import Finding
 
 store_app = typer.Typer(
@@ -16,8 +19,11 @@ store_app = typer.Typer(
 
 
 def import_(
+    ctx: typer.Context,
     path: Annotated[Path, typer.Argument(help="Campaign folder, or a single recording.")],
-    more: Annotated[list[Path] | None, typer.Argument(help="Further recordings.")] = None,
+    more: Annotated[
+        list[Path] | None, typer.Argument(help="Further folders, or recordings of one campaign.")
+    ] = None,
     store: StoreOption = None,
     title: Annotated[str, typer.Option(help="Title, for single recordings.")] = "",
     channel: Annotated[
@@ -38,22 +44,60 @@ def import_(
     amplitude_v: Annotated[float | None, typer.Option(help="Forcing amplitude.")] = None,
 ) -> None:
     """Bring recordings made elsewhere into the run store."""
-    from daq.errors import InputError
     from daq.importers import import_folder, import_recordings
     from daq.service.words import recording_options
 
-    if not path.exists():
-        raise InputError(f"{path}: no such file or folder")
+    paths = [path, *(more or [])]
+    if _are_folders(paths):
+        _require_no_options(ctx, path)
+        with open_store(store) as target:
+            for folder in paths:
+                _tell(target, import_folder(folder, target))
+        return
+    options = recording_options(
+        channel or [], column or [], rate_hz, kind, frequency_hz, amplitude_v
+    )
     with open_store(store) as target:
-        if path.is_dir():
-            card = import_folder(path, target)
-        else:
-            options = recording_options(
-                channel or [], column or [], rate_hz, kind, frequency_hz, amplitude_v
-            )
-            card = import_recordings([path, *(more or [])], options, target, title)
-        runs = target.campaign_runs(card.id)
-    out.print(f"imported [bold]{card.id}[/bold]: {len(runs)} runs")
+        _tell(target, import_recordings(paths, options, target, title))
+
+
+def _are_folders(paths: list[Path]) -> bool:
+    """Whether all are folders; refuses what is missing, and folders beside files."""
+    from daq.errors import InputError
+
+    for path in paths:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+    folders = [path for path in paths if path.is_dir()]
+    files = [path for path in paths if not path.is_dir()]
+    if folders and files:
+        raise InputError(
+            f"{folders[0]} is a campaign folder and {files[0]} a single recording: "
+            "import folders and recordings separately"
+        )
+    return bool(folders)
+
+
+def _require_no_options(ctx: typer.Context, folder: Path) -> None:
+    """Refuse the options of single recordings: a folder's campaign.toml says all that they say."""
+    from daq.errors import InputError
+
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name in ctx.params
+        if name not in ("path", "more", "store")
+        and (source := ctx.get_parameter_source(name)) is not None
+        and source.name == "COMMANDLINE"
+    ]
+    if given:
+        raise InputError(
+            f"{folder}: {', '.join(given)}: only for single recordings; the campaign.toml of a "
+            "folder says what they say"
+        )
+
+
+def _tell(store: "RunStore", card: "CampaignCard") -> None:
+    out.print(f"imported [bold]{escape(card.id)}[/bold]: {len(store.campaign_runs(card.id))} runs")
 
 
 def list_campaigns(
@@ -88,9 +132,11 @@ def show_campaign(
         folder = open_campaign(campaign, source)
         card = read_card(folder / "campaign.json")
         runs = [read_summary(path, card.id) for path in sorted((folder / "runs").glob("*.h5"))]
-    out.print(f"[bold]{card.id}[/bold]  {card.title}")
-    out.print(f"rig {card.rig or '–'}, created {card.created_at}, status {card.status}")
-    out.print(f"verdict {card.verdict or 'not diagnosed yet'}")
+    out.print(f"[bold]{escape(card.id)}[/bold]  {escape(card.title)}")
+    out.print(
+        f"rig {card.rig or '–'}, created {card.created_at}, status {card.status}", markup=False
+    )
+    out.print(f"verdict {card.verdict or 'not diagnosed yet'}", markup=False)
     table(
         "",
         ("run", "kind", "role", "f (Hz)", "amplitude (V)", "seconds", "exit"),
@@ -116,7 +162,7 @@ def rebuild(store: StoreOption = None) -> None:
         problems = target.rebuild()
         count = sum(1 for _ in target.folders())
     for problem in problems:
-        out.print(f"[yellow]left out:[/yellow] {problem}", markup=True)
+        out.print(f"[yellow]left out:[/yellow] {escape(problem)}")
     out.print(f"catalogue rebuilt: {count} campaigns, {len(problems)} files left out")
     if problems:
         raise typer.Exit(1)
