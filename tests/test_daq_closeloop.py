@@ -2,7 +2,8 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from multiprocessing import Pipe
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,13 @@ from daq.designed import Design
 from daq.errors import InputError
 from daq.plan import Condition, Plan, parse_plan, read_plan
 from daq.records import Kind, RunSummary
+from daq.service import loop_work
+from daq.service.jobs import Link
 from daq.service.loop_work import RigSteps, turn
+from daq.service.rigs import SIMULATED, RigEntry, open_simulated
 from daq.store import RunStore
+from daq.supervise import Limit
+from drivers.protocols import DuplexRig
 from identify.load import load_campaign
 from simulated_rig import build_rig
 
@@ -203,6 +209,32 @@ def test_a_loop_on_a_rig_stops_goes_on_and_reaches_its_verdict(store: RunStore) 
 
 def _never() -> None:
     raise AssertionError("the rig was asked again")
+
+
+def test_a_loop_as_a_job_goes_on_with_the_options_that_it_began_with(
+    store: RunStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Begun with ``--sealed --seed 5`` in a terminal, taken up over REST, stopped both times."""
+    opened: list[RigEntry] = []
+
+    def open_rig(entry: RigEntry) -> DuplexRig:
+        opened.append(entry)
+        return open_simulated(entry)
+
+    monkeypatch.setattr(loop_work, "open_rig", open_rig)
+    at_once = replace(SMALL, limits=(Limit("p1", high=1e-6, action="end"),))
+    laid = {"seed": 5, "effects": "sealed"}
+    with open_simulated(RigEntry("tube", SIMULATED, laid)) as rig:
+        turn("loop", at_once, RigSteps(rig, store, lambda: None, rig_options=laid), store, Budget())
+    ours, theirs = Pipe()
+    with ours, theirs:
+        tube = asdict(RigEntry("tube", SIMULATED, {"noise_db": 60.0}))
+        report = str(tmp_path / "report.html")
+        closed = loop_work.work(
+            Link(theirs), tube, str(store.root), {}, "loop", 1, 60.0, report, resume=True
+        )
+    assert closed["ending"] == "stopped"
+    assert [entry.options for entry in opened] == [{"noise_db": 60.0, **laid}]
 
 
 def test_a_doubted_run_is_recorded_once_more_on_the_rig(store: RunStore) -> None:
