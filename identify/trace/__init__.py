@@ -13,9 +13,9 @@
    are tried, others in the place of each and of all, and what had not converged is led to the end
    (`contests`).
 4. What explains the data must also have converged, predict the validation runs, lie in its
-   plausible range, take most of the misfit away by more than chance, and have no rival: another effect that does as
-   well, complexity counted (`tried`), nor, where it leaves more than noise mostly does, a freely
-   shaped piece that is far likelier; a spread, no spread at another place.
+   plausible range, take most of the misfit away by more than chance, and have no rival: another
+   effect that does as well, complexity counted (`tried`), nor, where it leaves more than noise
+   mostly does, a freely shaped piece that is far likelier; a spread, no spread at another place.
 5. Where nothing explains the data, freely shaped pieces and the single effects say where in the
    loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`). Where
    none of all these but a spread, or one law beside one, comes near, that is claimed though it
