@@ -37,7 +37,7 @@ def progress_bar(quiet: bool) -> Iterator[Tell]:
     from daq.service.commands.common import err
 
     bar = Progress(
-        TextColumn("{task.description:<44.44}"),
+        TextColumn("{task.description:<44.44}", markup=False),
         BarColumn(),
         TimeElapsedColumn(),
         console=err,

@@ -17,8 +17,8 @@ from rich.table import Table
 if TYPE_CHECKING:
     from daq.store import RunStore
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+out = Console(highlight=False, emoji=False)
+err = Console(stderr=True, highlight=False, emoji=False)
 
 StoreOption = Annotated[
     Path | None, typer.Option("--store", help="Run store; else the configured one.")
@@ -76,7 +76,7 @@ def open_store(place: Path | None) -> Iterator["RunStore"]:
 
 def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table; every cell is text, never markup."""
-    shown = Table(title=title or None, title_justify="left")
+    shown = Table(title=escape(title) or None, title_justify="left")
     for index, column in enumerate(columns):
         shown.add_column(column, no_wrap=index == 0, overflow="fold")
     for row in rows:

@@ -64,4 +64,4 @@ def list_keys() -> None:
 def revoke(key: Annotated[str, typer.Argument(help="The key's id.")]) -> None:
     """End a key at once, in running services too."""
     revoked = _store().revoke(key)
-    out.print(f"key {revoked.id} of {revoked.name!r} is revoked")
+    out.print(f"key {revoked.id} of {revoked.name!r} is revoked", markup=False)

@@ -9,6 +9,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from daq.service.commands.common import (
@@ -186,7 +187,7 @@ class CampaignView:
         from daq.campaign import expand
 
         self._progress = Progress(
-            TextColumn("{task.description:<52}"),
+            TextColumn("{task.description:<52}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeElapsedColumn(),
@@ -357,9 +358,7 @@ def check(
         found = check_rig(device, level, frequency_hz)
     marks = {True: "[green]good[/]", False: "[red]bad[/] ", None: "    "}
     for one in found:
-        out.print(
-            f"{marks[one.ok]} {one.name:<28} {number(one.value)} {one.unit:<6} {one.text}",
-            soft_wrap=True,
-        )
+        said = escape(f"{one.name:<28} {number(one.value)} {one.unit:<6} {one.text}")
+        out.print(f"{marks[one.ok]} {said}", soft_wrap=True)
     if any(one.ok is False for one in found):
         raise typer.Exit(1)
