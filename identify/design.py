@@ -353,6 +353,12 @@ def plan_of(
     return plan
 
 
+ELSEWHERE = (
+    "This campaign was recorded elsewhere: add the new runs to its folder, in campaign.toml too, and "
+    "diagnose that again; by themselves they are another campaign."
+)
+
+
 def next_experiment(
     rivals: Sequence[Rival], ready: Prepared, verdict: str
 ) -> dict[str, Any] | None:
@@ -377,8 +383,9 @@ def next_experiment(
         chosen = sharpen(best, ready, reach, record_s=record_s, runs=missing, given=told)
     names = [r.name for r in usable]
     least = min(told.pairs.values())
+    continues = continued(ready.campaign)
     return {
-        "reason": _reason(names, chosen, verdict),
+        "reason": _reason(names, chosen, verdict) + ("" if continues else f" {ELSEWHERE}"),
         "rivals": names,
         "expected_discrimination": least,
         "pairs": [
@@ -402,7 +409,7 @@ def next_experiment(
             ready,
             f"next: {' or '.join(names)}"[:120],
             record_s,
-            continued(ready.campaign),
+            continues,
         ),
     }
 

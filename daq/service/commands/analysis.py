@@ -303,7 +303,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
     elif any(q.flag == "contradicts_alone" for q in found.quality):
         out.print("next experiment: record the doubted run again")
     elif found.verdict == "ambiguous" or found.whereabouts is not None:
-        out.print("next experiment: none within the rig's reach tells the nearest apart")
+        out.print("next experiment: none is proposed")
 
 
 def show_quality(found: "Identification | Diagnosis") -> None:

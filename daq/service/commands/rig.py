@@ -94,12 +94,20 @@ def resume(
     json_: JsonOption = None,
 ) -> None:
     """Go on with a campaign that was stopped or interrupted."""
+    from dataclasses import replace
+
     from daq.service.campaign_names import begun_with
+    from daq.service.loop_work import RIG_OPTIONS, laid_over
 
     with open_store(store) as source:
         plan = begun_with(source, campaign)
-        recorded_on = source.card(campaign).rig
-    _campaign(plan, choose_rig(rig or recorded_on, seed), store, campaign, json_)
+        card = source.card(campaign)
+        entry = choose_rig(rig or card.rig, seed)
+        if RIG_OPTIONS in card.notes:  # a loop's: on the rig as that laid it out
+            given = {} if seed is None else {"seed": seed}
+            laid = laid_over(choose_rig(rig or card.rig), given, source, campaign)
+            entry = replace(entry, options={**entry.options, **laid})
+    _campaign(plan, entry, store, campaign, json_)
 
 
 def rehearse(

@@ -48,7 +48,7 @@ export async function drawDiagnosis(job) {
       [c.plausible ? "" : "implausible", c.equivalent_to.length ? `not told apart from ${c.equivalent_to.join(", ")}` : "", c.note || ""].filter(Boolean).join("; ")]), { numeric: [2, 3, 4], empty: "none was needed" })),
     d.whereabouts ? card("", d.whereabouts.from_run_to_run ? "Where it may lie: it differs from run to run" : "Where it may lie", table("χ²/dof with a free shape or one known effect in that place of the loop", ["place", "χ²/dof", "verdict"], [["nowhere: as declared", num(d.whereabouts.before, 4), ""],
       ...Object.entries(d.whereabouts.chi2_per_dof).map(([place, left]) => [place, num(left, 4), d.whereabouts.likely.includes(place) ? "may lie here" : "ruled out, or too little taken up"])], { numeric: [1] })) : "",
-    card("", "Next experiment", next ? [h("p", {}, next.reason || next.why || "What to measure to tell the rivals apart:"), h("pre", { class: "scroll", tabindex: "0" }, JSON.stringify(next, null, 1)), h("button", { type: "button", class: "primary", onclick: run }, "Run it")] : h("p", {}, "None is needed.")),
+    card("", "Next experiment", next ? [h("p", {}, next.reason || next.why || "What to measure to tell the rivals apart:"), h("pre", { class: "scroll", tabindex: "0" }, JSON.stringify(next, null, 1)), h("button", { type: "button", class: "primary", onclick: run }, "Run it")] : h("p", {}, ["traced", "no_discrepancy"].includes(d.verdict) ? "None is needed." : "None is proposed.")),
     card("w6", "Parameters before", parameterTable("", d.before.parameters)),
     card("w6", "Parameters after", parameterTable("", d.after.parameters)),
     curveCards(detail.curves),
