@@ -354,8 +354,8 @@ def plan_of(
 
 
 ELSEWHERE = (
-    "This campaign was recorded elsewhere: add the new runs to its folder, in campaign.toml too, and "
-    "diagnose that again; by themselves they are another campaign."
+    "This campaign was recorded elsewhere: add the new runs to its folder, in campaign.toml too, "
+    "and diagnose that again; by themselves they are another campaign."
 )
 
 
