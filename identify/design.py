@@ -227,6 +227,11 @@ def _promising(rates: dict[int, float], options: Sequence[Option]) -> list[int]:
     return list(out.values())
 
 
+def reach_in(ready: Prepared) -> Reach:
+    """What the rig of a campaign can do; nothing near runs that the quality gate has excluded."""
+    return reach_of(ready.campaign, ready.measured, ready.data.free_hz, ready.quality.excluded)
+
+
 @dataclass(frozen=True)
 class Rival:
     """An explanation by name, as fitted."""
@@ -371,7 +376,7 @@ def next_experiment(
     usable = (settled if len(settled) > 1 else finite)[:MOST_RIVALS]
     if len(usable) < 2:
         return None
-    reach = reach_of(ready.campaign, ready.measured, ready.data.free_hz, ready.quality.excluded)
+    reach = reach_in(ready)
     told = tell_apart(usable, ready, reach)
     if not told.options:
         return None

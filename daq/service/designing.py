@@ -20,7 +20,7 @@ from identify.diagnosis import diagnose
 from identify.fit import Fit
 from identify.identification import Prepared, identify, prepare
 from identify.load import load_campaign
-from identify.reach import Cost, Option, Reach, reach_of
+from identify.reach import Cost, Option, Reach
 from identify.record import Campaign, DeclaredModel
 from identify.structure import Structure
 
@@ -73,7 +73,7 @@ def expected_precision(plan: Plan, store: RunStore) -> list[dict[str, Any]]:
     fit, ready = _fitted(campaign)
     if not fit.converged:
         return []
-    options = _options(plan, reach_in(ready))
+    options = _options(plan, design.reach_in(ready))
     after = design.expected_estimates(fit, ready, design.Chosen(options))
     return [
         {
@@ -94,11 +94,6 @@ def _campaign(plan: Plan, store: RunStore) -> Campaign:
     if plan.design is not None and plan.design.model is not None:
         campaign = replace(campaign, declared_model=DeclaredModel(**plan.design.model))
     return campaign
-
-
-def reach_in(ready: Prepared) -> Reach:
-    """What the rig of a campaign can do; nothing near runs that the quality gate has excluded."""
-    return reach_of(ready.campaign, ready.measured, ready.data.free_hz, ready.quality.excluded)
 
 
 _LAST: list[tuple[str, Fit, Prepared]] = []
@@ -123,7 +118,7 @@ def _sharpened(plan: Plan, campaign: Campaign, progress: Progress | None) -> dic
     chosen = design.sharpen(
         fit,
         ready,
-        reach_in(ready),
+        design.reach_in(ready),
         record_s=plan.record_s,
         runs=plan.design.runs,
         budget_s=float("inf") if plan.design.minutes is None else 60 * plan.design.minutes,
@@ -140,7 +135,7 @@ def _told_apart(plan: Plan, campaign: Campaign, progress: Progress | None) -> di
         return _proposed(found["next_experiment"], plan.design)
     ready = prepare(campaign)
     rivals = [_rival(name, ready) for name in plan.design.rivals]
-    reach = reach_in(ready)
+    reach = design.reach_in(ready)
     told = design.tell_apart(rivals, ready, reach).options
     chosen = design.Chosen(_within(told, plan.design, reach.cost))
     record_s = told[0].record_s if told else plan.record_s

@@ -19,7 +19,6 @@ def design(
     store: StoreOption = None,
 ) -> None:
     """Choose the conditions that tell most about the declared model's parameters (D-optimal)."""
-    from daq.service.designing import reach_in
     from identify import design as choice
     from identify.identification import identify, prepare
 
@@ -32,7 +31,7 @@ def design(
         out.print(f"the fit did not converge: {fit.reason}", markup=False)
         raise typer.Exit(1)
     ready = prepare(recorded)
-    reach = reach_in(ready)
+    reach = choice.reach_in(ready)
     budget = float("inf") if minutes is None else 60 * minutes
     chosen = choice.sharpen(fit, ready, reach, runs=runs, budget_s=budget)
     if not chosen.options:
