@@ -256,7 +256,7 @@ def test_one_run_alone_is_no_evidence_of_a_cause(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_an_effect_that_others_kept_from_its_refit(tmp_path: Path) -> None:
     """Thirteen forms come nearer at coarse noise than a gross loss of end and mouth, and are the
-    ones refitted: none comes within a hundred times the noise. By itself it does."""
+    first ones refitted: among them none explains the data. By itself it does."""
     loss = make_effect("nonlinear_damping/cubic", {"cubic_s_per_m2": 3.938})
     rig = random_rig(30678, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
     ready = record(tmp_path, 30678, rig, [loss], forced=7, validation=2)
@@ -273,7 +273,7 @@ def test_an_effect_that_others_kept_from_its_refit(tmp_path: Path) -> None:
     )
     forms = [*map(by_key, nearer), *(e for e in CATALOGUE if e.name == "nonlinear_damping")]
     found = trace.search(ready.structure, ready.data, base, catalogue=forms, depth=1)
-    assert min(t.fit.chi2_per_dof for t in found.singles) > 100.0
+    assert not any(t.explains for t in found.singles)
     (best,) = (t for t in found.tried if t.explains)
     assert best.key_of_forms == ("nonlinear_damping:cubic_end",)
 

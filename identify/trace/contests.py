@@ -544,7 +544,7 @@ def _further(item: tuple[Tried, Dataset]) -> Fit:
 
 
 def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
-    """What had not converged and might yet be a rival of the best, led to the end.
+    """What had not converged and might yet be a rival of the best, or is the best, led to the end.
 
     Weak effects leave long flat valleys: a rival must not be ruled out for want of iterations. Each
     form for itself: which of an effect's forms comes nearest before the end says little.
@@ -561,7 +561,11 @@ def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]
         and not best.parts < t.parts  # no rival, whatever it comes to
     ]
     near = sorted(near, key=lambda t: t.evidence)[:SETTLED]
-    return _where_better(near, run.map(_to_the_end, [(t, data) for t in near]), data)
+    found = _where_better(near, run.map(_to_the_end, [(t, data) for t in near]), data)
+    claimed = best_form([*good, *(t for t in found if t.explains)])
+    if claimed.fit.converged:
+        return found
+    return [*found, *_where_better([claimed], [_further((claimed, data))], data)]
 
 
 def _to_the_end(item: tuple[Tried, Dataset]) -> Fit:
