@@ -25,7 +25,7 @@ from daq.service.commands.common import (
 
 if TYPE_CHECKING:
     from identify.record import Campaign
-    from identify.results import Diagnosis, Identification, QualityFlag
+    from identify.results import Candidate, Diagnosis, Identification, QualityFlag
 
 CampaignArgument = Annotated[str, typer.Argument(help="Campaign folder, or campaign id.")]
 Tell = Callable[[float, str], None]
@@ -278,12 +278,11 @@ def show_diagnosis(found: "Diagnosis") -> None:
         other = "the first is likelier" if claimed else "not the cause by itself"
         table(
             "candidates, best first",
-            ("effects", "where", "χ²/dof", "validation error", "objection"),
+            ("effects", "where", "χ²/dof", "validation", "objection"),
             (
                 (
-                    " +\n".join(c.named),  # one a line: three would leave no room
-                    "\n".join(c.locations),
-                    number(c.chi2_per_dof),
+                    *in_lines(c),
+                    number(c.chi2_per_dof, 3),
                     number(c.validation_error, 3),
                     c.objection or ("" if c.words in as_good else other),
                 )
@@ -294,7 +293,8 @@ def show_diagnosis(found: "Diagnosis") -> None:
     out.print(f"[bold]verdict: {found.verdict}[/bold]   ({found.seconds:.1f} s)")
     for effect in found.effects:
         row = effect.to_json()
-        show_parameters(f"{row['effect']} ({row['location']})", row["parameters"])
+        form = f", {effect.form}" if effect.form else ""
+        show_parameters(f"{row['effect']}{form} ({row['location']})", row["parameters"])
     if found.explanation:
         out.print(found.explanation, markup=False)
     if found.next_experiment:
@@ -304,6 +304,14 @@ def show_diagnosis(found: "Diagnosis") -> None:
         out.print("next experiment: record the doubted run again")
     elif found.verdict == "ambiguous" or found.whereabouts is not None:
         out.print("next experiment: none is proposed")
+
+
+def in_lines(c: "Candidate") -> tuple[str, str]:
+    """Effects and their places, line by line: several in a row would leave the numbers no room."""
+    effects = " +\n".join(c.named).replace(":", ":\n  ").split("\n")
+    places = iter(c.locations)
+    where = ["" if line.startswith(" ") else next(places) for line in effects]
+    return "\n".join(effects), "\n".join(where)
 
 
 def show_quality(found: "Identification | Diagnosis") -> None:
