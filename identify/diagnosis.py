@@ -326,7 +326,8 @@ def _judge(
         return "no_discrepancy", None, _not_contradicted(declared.fit)
     good = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
     good = [t for t in good if not trace.outdone(t, pieces)]
-    ended = [t for t in good if t.fit.converged]  # only what has values is claimed
+    # only what has come to values is claimed; a spread's are those of its likelihood
+    ended = [t for t in good if t.spread is not None or t.fit.ended]
     if ended:
         best = trace.best_form(ended)
         spreads = [t for t in tried if t.spread is not None and not t.explains]

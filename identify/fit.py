@@ -34,6 +34,7 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
+AT_REST = "no step lowers the misfit any further"
 HOPE = 20  # iterations for what may be given up as hopeless …
 SHORTLY = 10  # … and for fits of which only those near to the noise matter
 VALLEY = 20  # iterations after which a descent is taken to follow one
@@ -61,6 +62,12 @@ class Fit:
     converged: bool
     reason: str
     iterations: int
+
+    @property
+    def ended(self) -> bool:
+        """Whether its descent came to an end: converged, or where rounding, a corner or an edge
+        lets no step down."""
+        return self.converged or self.reason == AT_REST
 
     @property
     def chi2_per_dof(self) -> float:
@@ -543,7 +550,7 @@ def _propose(
         return None
     if s.refused > patience:
         s.converged = promise < 1e-3 * enough
-        s.ended = "converged" if s.converged else "no step lowers the misfit any further"
+        s.ended = "converged" if s.converged else AT_REST
         return None
     if s.stuck:
         s.ended = "stuck at an edge beyond which no orbit exists"

@@ -801,10 +801,8 @@ def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     assert "far less likely than a law" in found.explanation
     assert found.whereabouts is not None
     assert "forward" in found.whereabouts.likely
-    monkeypatch.setattr(diagnosis, "DOUBTFUL", 0.0)  # uncontested, its fit speaks against itself
-    alone = identify.diagnose(recordings, catalogue=mode)
-    assert alone.verdict == "unexplained"
-    assert "acoustic_mode comes near to the data, with no values" in alone.explanation
+    monkeypatch.setattr(diagnosis, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
+    assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
 
 
 def test_two_drifts_at_once_are_one_effect_with_two_changes(tmp_path: Path) -> None:

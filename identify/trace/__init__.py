@@ -12,7 +12,7 @@
    effect. An effect stays only if leaving it out makes the fit significantly worse; other forms
    are tried, others in the place of each and of all, and what had not converged is led to the end
    (`contests`).
-4. What explains the data must also have converged, predict the validation runs, lie in its
+4. What explains the data must also have come to values, predict the validation runs, lie in its
    plausible range, take most of the misfit away by more than chance, and have no rival: another
    effect that does as well, complexity counted (`tried`), nor, where it leaves more than noise
    mostly does, a freely shaped piece that is far likelier; a spread, no spread at another place.
