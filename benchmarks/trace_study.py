@@ -3,6 +3,8 @@
     python benchmarks/trace_study.py clean   --count 400     model exactly as declared
     python benchmarks/trace_study.py effects --count 600     one or two effects the model lacks
     python benchmarks/trace_study.py leftout --count 200     one effect that no candidate names
+    python benchmarks/trace_study.py clean-turbulent   --count 200     as clean, noise in the loop
+    python benchmarks/trace_study.py effects-turbulent --count 100     as effects, noise in the loop
     python benchmarks/trace_study.py leftout-thesis --count 96     the same on the thesis's rig
     python benchmarks/trace_study.py thesis  --count 96      the thesis's rig, effect by effect
     python benchmarks/trace_study.py mixed   --count 100     the same with none, one or two of them
@@ -38,6 +40,8 @@ from simulated_rig.random_rigs import random_campaign, random_rig
 from simulated_rig.seal import SealedEffect
 
 Truth = dict[str, float]
+TURBULENCE = (-3.0, -1.3)  # decades of volts of drive: free lines 16 to 50 dB above their noise
+TURBULENT = ("clean-turbulent", "effects-turbulent")
 SIZES = (0.5, 0.2, 0.85)  # of `thesis`: in the range from barely visible to gross
 
 
@@ -111,8 +115,14 @@ def any_rig(
 ) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
     """A random rig, one or two effects or none, and how many runs of each kind."""
     rng = np.random.default_rng([seed, 71])
+    mode, _, turbulent = mode.partition("-")
+    volts = float(10 ** np.random.default_rng([seed, 72]).uniform(*TURBULENCE))
     rig = random_rig(
-        seed, noise_db=(30.0, 80.0), coloured=bool(rng.uniform() < 0.3), modes=(1, 2, 2, 2, 3)
+        seed,
+        noise_db=(30.0, 80.0),
+        coloured=bool(rng.uniform() < 0.3),
+        turbulence_v=volts if turbulent else 0.0,
+        modes=(1, 2, 2, 2, 3),
     )
     effects = []
     if mode != "clean":
@@ -305,7 +315,7 @@ def report(records: list[dict[str, Any]]) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("mode", choices=("clean", "effects", "leftout", *OWN_RIG))
+    parser.add_argument("mode", choices=("clean", "effects", "leftout", *TURBULENT, *OWN_RIG))
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", help="effects whose key starts so")

@@ -6,7 +6,9 @@ A forced run is a sum of harmonics of the drive's frequency: c_k with y(t) = Re 
 found by linear least squares over the record (for a whole number of periods, the DFT). The
 frequency is the drive's own, estimated from the drive channel; a free run's is estimated from
 the velocity. What the harmonics leave is noise, and its spectrum within a few hertz of kω gives
-the covariance of c_k, across harmonics too, because jitter of phase or amplitude correlates them.
+the covariance of c_k, across harmonics too, because jitter of phase or amplitude correlates them;
+where noise inside the loop stands higher at a line than beside it, `identify.linenoise` says by how
+much.
 A coarse converter adds what these neighbours do not show (`identify.quantisation`).
 
 No microphone, amplifier and converter are together more linear than a part in a million, whatever
@@ -24,6 +26,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
+from identify.linenoise import frequency_stderr, peak
 from identify.quantisation import added_variance
 from identify.record import Campaign, Kind, Medium, Role, Run
 
@@ -211,12 +214,15 @@ def measure(
     noise = noise * turn
     distorted = (DISTORTION * np.abs(velocity[0])) ** 2
     beside = coarse + covered + distorted
-    covariance = coefficient_covariance(noise) + np.diag(np.tile(beside, 2) / 2)
+    covariance = coefficient_covariance(noise)
+    if run.kind != "free":
+        covariance = raised(covariance, peak(noise))
+    covariance = covariance + np.diag(np.tile(beside, 2) / 2)
     stderr = 0.0
     if run.kind == "free":
         both = slice(0, len(inputs))
         reference_noise = side[both, :, 0].sum(axis=0)
-        stderr = _frequency_stderr(c[both, 0].sum(), reference_noise, run.duration_s)
+        stderr = frequency_stderr(complex(c[both, 0].sum()), reference_noise, run.duration_s)
     return Harmonics(
         name=run.name,
         kind=run.kind,
@@ -336,6 +342,14 @@ def coefficient_covariance(side: ComplexArray) -> FloatArray:
     return np.asarray((1 - shrink) * full + shrink * np.diag(np.diag(full)))
 
 
+def raised(covariance: FloatArray, power: FloatArray) -> FloatArray:
+    """The covariance (2K, 2K) with variances of at least `power` (K,); correlations as before."""
+    K = power.size
+    own = np.diag(covariance)[:K] + np.diag(covariance)[K:]
+    factor = np.sqrt(np.maximum(1.0, power / np.maximum(own, 1e-300)))
+    return np.asarray(covariance * np.outer(np.tile(factor, 2), np.tile(factor, 2)))
+
+
 def estimate_frequency(x: FloatArray, rate: float, low_hz: float = 20.0) -> float:
     """Frequency of the strongest line: peak of the spectrum, refined by demodulated phase.
 
@@ -408,20 +422,6 @@ def drive_frequency(drive: FloatArray, rate: float, nominal: float | None) -> fl
         if abs(found - nominal) < 1e-3 * rate / drive.size:
             return nominal
     return found
-
-
-def _frequency_stderr(c1: complex, side: ComplexArray, duration_s: float) -> float:
-    """Standard error (Hz) of a line's frequency over a record.
-
-    For phase noise white over the record, var(ω) = 12 σ_φ²/T² with σ_φ² = E|n|²/(2|c1|²); bins
-    near the line weigh most, so the larger of the inner and the overall level is taken.
-    """
-    power = np.abs(side) ** 2
-    half = side.size // 2
-    inner = np.mean(power[half - 3 : half + 3])
-    level = max(float(inner), float(typical(power)))
-    phase = np.sqrt(level / 2) / abs(c1)
-    return float(np.sqrt(12.0) * phase / duration_s / (2 * np.pi))
 
 
 Level = Literal["all", "fit", "validation"]
