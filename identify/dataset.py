@@ -44,6 +44,7 @@ class Batch:
     cold: npt.NDArray[np.bool_]
     started_s: FloatArray
     drive_noise: FloatArray | None = None  # E|n|² of each run's drive coefficients, (runs,)
+    pressure_noise: FloatArray | None = None  # of the pressure's at the harmonics balanced
 
     @property
     def runs(self) -> int:
@@ -70,8 +71,9 @@ class Batch:
             "started_s",
         )
         picked = {n: getattr(self, n)[rows] for n in arrays}
-        if self.drive_noise is not None:
-            picked["drive_noise"] = self.drive_noise[rows]
+        for n in ("drive_noise", "pressure_noise"):
+            if getattr(self, n) is not None:
+                picked[n] = getattr(self, n)[rows]
         names = tuple(self.names[int(i)] for i in rows)
         return replace(self, names=names, at=self.at.take(rows), **picked)
 
@@ -89,6 +91,7 @@ class Batch:
             noise=self.noise[:, :K],
             covariance=covariance,
             whitener=np.stack([whitener(c) for c in covariance]),
+            pressure_noise=None if self.pressure_noise is None else self.pressure_noise[:, :total],
         )
 
     def balanced(self, structure: Structure) -> "Batch":
@@ -231,6 +234,7 @@ def _batch(
         cold=np.array([h.kind == "cold" for h in hs]),
         started_s=np.array([h.started_s for h in hs]),
         drive_noise=np.array([h.drive_variance for h in hs]),
+        pressure_noise=pad([h.pressure_noise for h in hs]).real,
     )
 
 

@@ -8,7 +8,7 @@ the effect beside what had stood for it leaves far more than there was.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +23,8 @@ FloatArray = npt.NDArray[np.float64]
 
 DRAWS = 20_000  # of the bootstrap of the smallest p-value
 DECIDED = 1e-5  # Bonferroni's bound below which none is drawn
+ABOVE_NOISE = 5.0  # times the recorded pressure's noise that a tangent formed of it must stand
+NOISES = 4  # draws of that noise
 STEPS = np.array([1.0, 0.3, 0.1, 0.03, 0.01])  # shares of a Gauss–Newton step that are tried …
 NEAR = 10.0  # … and times the χ² there was that the best of them may leave
 
@@ -63,11 +65,39 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     share = float(np.linalg.norm(rest)) / norm
     if share < 1e-5:  # wholly absorbed: what is left of the tangent is rounding
         return None
+    if "pressure" in effect.needs:
+        noise = _of_noise(larger, data, np.r_[fit.theta, inner], tangent, Q)
+        if np.linalg.norm(rest) < ABOVE_NOISE * noise:
+            return None
     U, S, _ = np.linalg.svd(rest, full_matrices=False)
     basis = U[:, 1e-8 * S[0] < S]
     along = basis.T @ rho
     drop = float(along @ along)
     return ScoreTest(drop, share, chi2_tail(drop, basis.shape[1]), basis)
+
+
+def _of_noise(
+    larger: Structure, data: Dataset, theta: FloatArray, tangent: FloatArray, Q: FloatArray
+) -> float:
+    """How much of a tangent that is formed from the recorded pressure, beyond what `Q` spans, is
+    the pressure's noise. Where noise is sound, the velocity has the same: its residual lies along
+    such a tangent without any effect."""
+    rng = np.random.default_rng(0)
+    powers = []
+    for _ in range(NOISES):
+        batches = []
+        for b in data.fit:
+            if b.pressure_noise is None:
+                return 0.0
+            size = np.sqrt(b.pressure_noise / 2)
+            noise = size * (rng.standard_normal(size.shape) + 1j * rng.standard_normal(size.shape))
+            batches.append(replace(b, at=replace(b.at, pressure=b.at.pressure + noise)))
+        outcome = OrbitResidual(larger, tuple(batches))(theta[None], np.array([0]), True)
+        if outcome.jacobian is None or not outcome.exists[0]:
+            return 0.0
+        moved = outcome.jacobian[0][:, -tangent.shape[1] :] - tangent
+        powers.append(float(np.sum((moved - Q @ (Q.T @ moved)) ** 2)))
+    return float(np.sqrt(np.mean(powers)))
 
 
 def scan(
