@@ -194,7 +194,7 @@ def _batch(
     count = min(count, available)
     K = count + EXTRA_HARMONICS
 
-    def pad(values: Sequence[ComplexArray]) -> ComplexArray:
+    def pad(values: Sequence[ComplexArray | FloatArray]) -> ComplexArray:
         out = np.zeros((len(values), K), dtype=complex)
         for row, v in zip(out, values, strict=True):
             row[: min(K, v.size)] = v[:K]
@@ -234,7 +234,7 @@ def _batch(
         cold=np.array([h.kind == "cold" for h in hs]),
         started_s=np.array([h.started_s for h in hs]),
         drive_noise=np.array([h.drive_variance for h in hs]),
-        pressure_noise=pad([h.pressure_noise + 0j for h in hs]).real,
+        pressure_noise=pad([h.pressure_noise for h in hs]).real,
     )
 
 

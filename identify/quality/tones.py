@@ -43,6 +43,7 @@ OWN = 0.2  # of the run's frequency, next to which the rig's own resonance stand
 ORDERS = 200  # harmonics of a discontinuous loop that may fold into the band
 LEAST_ALONE = 5e-4  # of the fundamental: a smaller line in one run harms nothing
 SEEN_SHARE = 0.4  # of the runs in which a tone must not be hidden by the rig's own lines
+LEAST_SEEN = 3  # runs: where noise is sound, a lightly damped mode has a line in two by chance
 DIFFERENT = 4  # forcing frequencies, at least, of runs that have a line at the same place
 MAINS_HZ = (50.0, 60.0)
 MAINS_ORDERS = 20
@@ -119,7 +120,7 @@ def tones(
     for place in places(found, width):
         seen = seen_at(searched, place.frequency_hz)
         present = present_in(seen)
-        most = len(present) > 1 and len(seen) >= SEEN_SHARE * len(searched)
+        most = len(present) >= LEAST_SEEN and len(seen) >= SEEN_SHARE * len(searched)
         if most and len(place.runs) > 1 and 4 * place.around <= len(present):
             tone = common(place.frequency_hz, seen, present)
             if tone is not None:
