@@ -374,7 +374,10 @@ def _judge(
     elif any(trace.outdone(t, pieces) for t in near_it):
         said = "What comes near to the data is far less likely than a law that nobody here knows."
     elif near_it:
-        said = "What comes near to the data takes too little of the misfit away to be its cause."
+        said = (
+            "What comes near to the data takes too little more of the misfit away than what has an "
+            "effect less, or predicts the runs that no fit has seen worse."
+        )
     else:
         said = "No known effect explains the data to within noise."
     return "unexplained", chosen, said + left
