@@ -14,6 +14,7 @@ from identify.structure import Conditions, Effect, Known, Values
 FloatArray = npt.NDArray[np.float64]
 
 FINE = 2048  # samples a period: corners alias below 1e-6
+UNEQUAL = (0.87, 0.95, 1.05, 1.15)  # of one level, where the two of a pair are sought
 
 
 class SpeakerResonance(Effect):
@@ -204,6 +205,45 @@ class HardClipping(Effect):
         return _behind(wave, cut, 1 - np.abs(moved), K, (lambda: moved, level))
 
 
+class UnequalClipping(Effect):
+    """Rails of an amplifier that are not alike: the drive is cut off at one level above and at
+    another below."""
+
+    name, location, form = "actuator_nonlinearity", "actuator", "unequal_clipping"
+    parameters = (
+        Parameter("actuator_nonlinearity.upper_v", "V", 1e-9, np.inf, "positive"),
+        Parameter("actuator_nonlinearity.lower_v", "V", 1e-9, np.inf, "positive"),
+    )
+    refines = True
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        u = known.drive_amplitude
+        return [(q * share * u, share * u / q) for share in (0.5, 0.8) for q in UNEQUAL]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Levels on either side of one that stands for both."""
+        both = [values[q.name] for q in other.parameters if q.unit == "V"]
+        return [(q * level, level / q) for level in both for q in UNEQUAL]
+
+    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        if not np.any(dual.value(u)):
+            return u
+        K = at.harmonics
+        upper, lower = p["actuator_nonlinearity.upper_v"], p["actuator_nonlinearity.lower_v"]
+        wave = balance.to_time(u, K, FINE)
+        v = dual.value(wave)
+        above, below = v > dual.value(upper), v < -dual.value(lower)
+        cut = np.clip(v, -dual.value(lower), dual.value(upper))
+        return _behind(
+            wave,
+            cut,
+            1.0 - above - below,
+            K,
+            (lambda: above.astype(float), upper),
+            (lambda: -below.astype(float), lower),
+        )
+
+
 class Crossover(Effect):
     """An amplifier that passes nothing within ± a level, and beyond it what exceeds it."""
 
@@ -293,6 +333,7 @@ EFFECTS: tuple[Effect, ...] = (
     PowerCompression(),
     Clipping(),
     HardClipping(),
+    UnequalClipping(),
     Crossover(),
     Knee(),
 )

@@ -36,6 +36,7 @@ PURE_MEAN = 2.0  # the same on an average of runs, of a line where the mains hav
 PURE_KNOWN = 1.0  # where other runs have a line: what the chance PRESENT stands for
 PRESENT = 1e-3  # chance below which a known tone counts as present in a run
 ALPHA = 1e-6  # chance of a tone among noise, all runs and bins considered
+STILL_BINS, STILL = 0.45, 1e-3  # deviation between runs, in bins or of the frequency, of a tone
 CREST_BINS = 0.01  # to which the parabola through a line's three bins places it
 SAME_BINS = 0.75  # peaks this near belong together
 AROUND_BINS = 15.0  # where scattered peaks betray a resonance
@@ -261,19 +262,23 @@ def present_in(seen: Sequence[Sighting]) -> list[Sighting]:
 def common(
     frequency_hz: float, seen: Sequence[Sighting], present: Sequence[Sighting]
 ) -> Tone | None:
-    """The tone with its mean amplitude; None when noise could do it (Fisher's sum over runs)."""
+    """The tone with its mean amplitude; None when noise could do it (Fisher's sum over runs), or
+    where it wanders from run to run as the highest bin of a resonance in noise does."""
     chance = np.array([s.chance for s in seen])
     statistic = -2 * float(np.sum(np.log(np.maximum(chance, 1e-300))))
     bins = max(s.where.ratio.size for s in seen)
     p_value = min(1.0, bins * chi2_tail(statistic, 2 * chance.size))
     if p_value > ALPHA:
         return None
+    at = np.array([(s.bin + crest(s.view, s.bin)[0]) * s.view.bin_hz for s in present])
+    still = max(STILL_BINS * present[0].view.bin_hz, STILL * frequency_hz)
+    if at.size > 1 and float(np.std(at, ddof=1)) > still:
+        return None
     amplitude = np.array([velocity(s) for s in present])
     noise = amplitude / np.sqrt([max(s.ratio, 1.0) for s in present])
     # seen in one run, it may be another in the next one
     spread = _of_mean(amplitude, alone=float(amplitude[0]) / 2)
     stderr = max(spread, float(np.sqrt(np.sum(noise**2)) / amplitude.size))
-    at = np.array([(s.bin + crest(s.view, s.bin)[0]) * s.view.bin_hz for s in present])
     wander = _of_mean(at, alone=0.0)
     first = present[0].view
     placed = float(np.hypot(wander, CREST_BINS * first.bin_hz))
