@@ -237,7 +237,7 @@ class UnequalClipping(Effect):
         return _behind(
             wave,
             cut,
-            1.0 - above - below,
+            np.asarray(~(above | below), dtype=np.float64),
             K,
             (lambda: above.astype(float), upper),
             (lambda: -below.astype(float), lower),
