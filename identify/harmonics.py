@@ -38,6 +38,7 @@ VARIANCE_DOF = 4 * SIDE_BINS  # real degrees of freedom behind each estimated va
 SEGMENTS = 256  # a record's demodulated signal is averaged to this many points
 APART_BINS = 2.0  # a tone nearer to a harmonic cannot be fitted beside it
 DISTORTION = 1e-6  # of the fundamental in each harmonic: the best of recording chains, −120 dB
+BARELY_LOCKED = 0.8  # share of forced runs that may be: a peak in more is a modulation
 NO_TONES: Mapping[float, float] = MappingProxyType({})
 
 
@@ -215,8 +216,6 @@ def measure(
     distorted = (DISTORTION * np.abs(velocity[0])) ** 2
     beside = coarse + covered + distorted
     covariance = coefficient_covariance(noise)
-    if run.kind != "free":
-        covariance = raised(covariance, peak(noise))
     covariance = covariance + np.diag(np.tile(beside, 2) / 2)
     stderr = 0.0
     if run.kind == "free":
@@ -434,8 +433,16 @@ def measure_campaign(
     tones: Mapping[float, float] = NO_TONES,
 ) -> list[Harmonics]:
     """All usable runs of a campaign, in the order recorded; `skip` names runs left out."""
-    return [
+    found = [
         measure(run, campaign.medium, harmonics, tones)
         for run in campaign.runs
         if run.exit_status == "success" and run.name not in skip
+    ]
+    peaks = {h.name: peak(h.side) for h in found if h.kind == "forced"}
+    peaked = {name: power for name, power in peaks.items() if power.any()}
+    if len(peaked) > BARELY_LOCKED * len(peaks):
+        return found
+    return [
+        replace(h, covariance=raised(h.covariance, peaked[h.name])) if h.name in peaked else h
+        for h in found
     ]

@@ -7,7 +7,8 @@ In white noise the bins beside a line say what is in it. Inside a loop that osci
   D T/(2π m)² over bins m, and the least-squares frequency has var ω = (6/5) D/T, many times what
   white noise of the same power would leave.
 * A forced one returns with the rate at which it locks. Near the edge of the tongue that is a few
-  hertz, and the noise peaks at the line as a Lorentzian that is narrower than the bins looked at.
+  hertz, and the noise peaks at the line as a Lorentzian narrower than the bins looked at. (A peak
+  in nearly all runs, well locked ones too, is a modulation: that is for the diagnosis to find.)
 
 Both are fitted to the bins' powers by maximum likelihood (exponential, Whittle's): a part that is
 the same in all bins, and one of the expected shape.
