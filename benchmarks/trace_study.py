@@ -40,7 +40,7 @@ from simulated_rig.random_rigs import random_campaign, random_rig
 from simulated_rig.seal import SealedEffect
 
 Truth = dict[str, float]
-TURBULENCE = (-3.0, -1.3)  # decades of volts of drive: free lines 16 to 50 dB above their noise
+TURBULENCE = (-3.0, -1.3)  # decades of volts of drive
 TURBULENT = ("clean-turbulent", "effects-turbulent")
 SIZES = (0.5, 0.2, 0.85)  # of `thesis`: in the range from barely visible to gross
 

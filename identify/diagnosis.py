@@ -326,10 +326,9 @@ def _judge(
         return "no_discrepancy", None, _not_contradicted(declared.fit)
     good = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
     good = [t for t in good if not trace.outdone(t, pieces)]
-    # only what has come to values is claimed; a spread's are those of its likelihood
-    ended = [t for t in good if t.spread is not None or t.fit.ended]
-    if ended:
-        best = trace.best_form(ended)
+    settled = [t for t in good if t.has_values]  # of these alone one is claimed
+    if settled:
+        best = trace.best_form(settled)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
         implausible = [t for t in tried if t.spread is None and t.adequate and not t.plausible]
         others = trace.rivals(best, [*good, *spreads, *implausible])

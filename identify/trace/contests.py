@@ -563,7 +563,7 @@ def settled(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]
     near = sorted(near, key=lambda t: t.evidence)[:SETTLED]
     found = _where_better(near, run.map(_to_the_end, [(t, data) for t in near]), data)
     claimed = best_form([*good, *(t for t in found if t.explains)])
-    if claimed.spread is not None or claimed.fit.ended:
+    if claimed.has_values:
         return found
     return [*found, *_where_better([claimed], [_further((claimed, data))], data)]
 

@@ -110,6 +110,11 @@ class Tried:
         return self.fit_p > (LEFT_P if len(self.effects) == 1 else LEFT_BESIDE_P)
 
     @property
+    def has_values(self) -> bool:
+        """Whether its fit came to an end; a spread's values are those of its likelihood."""
+        return self.spread is not None or self.fit.ended
+
+    @property
     def objection(self) -> str:
         """What speaks against its spread, if it has one."""
         if self.spread is None or (self.spread.unrivalled and self.spread.luck > LUCK):

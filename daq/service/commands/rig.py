@@ -102,11 +102,11 @@ def resume(
     with open_store(store) as source:
         plan = begun_with(source, campaign)
         card = source.card(campaign)
-        entry = choose_rig(rig or card.rig, seed)
+        entry = choose_rig(rig or card.rig)
+        laid = {} if seed is None else {"seed": seed}
         if RIG_OPTIONS in card.notes:  # a loop's: on the rig as that laid it out
-            given = {} if seed is None else {"seed": seed}
-            laid = laid_over(choose_rig(rig or card.rig), given, source, campaign)
-            entry = replace(entry, options={**entry.options, **laid})
+            laid = laid_over(entry, laid, source, campaign)
+        entry = replace(entry, options={**entry.options, **laid})
     _campaign(plan, entry, store, campaign, json_)
 
 
