@@ -10,8 +10,10 @@ makes the list of items, `daq.runner` carries it out.
 """
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from daq.continued import require_continuable
 from daq.designed import Design
@@ -65,6 +67,7 @@ def run_campaign(
     review: Reviewer | None = None,
     campaign: str | None = None,
     campaign_id: str = "",
+    notes: Mapping[str, Any] | None = None,
 ) -> CampaignResult:
     """Run `plan` on `rig` into `store`.
 
@@ -83,6 +86,8 @@ def run_campaign(
         The id of a campaign to go on with; its own plan is then used, `plan` is not.
     campaign_id
         The id that a new campaign shall have; made from the date and the title when empty.
+    notes
+        What a new campaign's card shall say beside what is known here.
 
     Raises
     ------
@@ -105,7 +110,7 @@ def run_campaign(
             declared_model=plan.declared_model,
             status="running",
             documents={"plan.json": asdict(plan)},
-            notes={"continues": plan.continues} if plan.continues else {},
+            notes={**(notes or {}), **({"continues": plan.continues} if plan.continues else {})},
         )
         campaign = card.id
     else:

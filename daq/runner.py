@@ -41,6 +41,7 @@ from daq.supervise import (
     SkipRequested,
     StopRequested,
     Supervisor,
+    end_asked,
 )
 from daq.tongue import Law
 from daq.two_microphones import validity
@@ -128,6 +129,12 @@ class Runner:
                     break
         except (StopRequested, LimitExceeded, InterlockTripped, LimitCycleLost) as stop:
             status, reason = "stopped", str(stop) or "stopped on request"
+        except InterlockOpen:
+            # an emergency stop that people gave can fall between two windows
+            asked = None if self.control is None else end_asked(self.control)
+            if asked is None:
+                raise
+            status, reason = "stopped", asked
         finally:
             self.rig.stop()
         self.emit("finished", None, {"status": status, "reason": reason})

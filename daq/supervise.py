@@ -7,7 +7,7 @@ for `clear_s`, looks at the limit cycle anew and repeats the condition that was 
 interlock that opens has stopped the rig already; an `InterlockRule` says what the campaign does.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,6 +31,17 @@ class SkipRequested(Interruption):
 
 class Paused(Interruption):
     """The operator wants silence for a while."""
+
+
+def end_asked(control: Callable[[], None]) -> str | None:
+    """Why a campaign's `control` asks for its end; None where it does not."""
+    try:
+        control()
+    except StopRequested as asked:
+        return str(asked) or "stopped on request"
+    except SkipRequested:
+        pass
+    return None
 
 
 class LimitExceeded(Interruption):

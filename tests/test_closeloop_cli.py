@@ -80,8 +80,25 @@ def test_a_sealed_loop_goes_on_with_the_plant_that_it_began_with(
     assert entrain(capfd, "close-loop", "--resume", name, "--seed", "5", "--sealed")[0] == 1
     code, out, err = entrain(capfd, "close-loop", "--resume", name, "--seed", "6")
     assert (code, out) == (2, "")
-    assert f"seed=6: loop '{name}' began with 5" in err
+    assert f"seed=6: '{name}' began with 5" in err
     assert len(opened) == 3
+
+
+def test_a_seeded_campaign_goes_on_with_the_plant_that_it_began_with(
+    home: Path,  # noqa: F811
+    capfd: pytest.CaptureFixture[str],
+    opened: list[dict[str, Any]],
+) -> None:
+    plan = written(home, PLAN + AT_ONCE)
+    code, out, err = entrain(capfd, "campaign", "run", plan, "--seed", "5", "--json", "-")
+    assert (code, err) == (1, "")
+    name = json.loads(out)["campaign"]
+    assert entrain(capfd, "campaign", "resume", name)[0] == 1
+    assert entrain(capfd, "campaign", "resume", name, "--seed", "5")[0] == 1
+    assert opened == [{"seed": 5}] * 3
+    code, out, err = entrain(capfd, "campaign", "resume", name, "--seed", "6")
+    assert (code, out) == (2, "")
+    assert f"seed=6: '{name}' began with 5" in err
 
 
 def test_a_loop_that_began_unsealed_is_not_sealed_later(

@@ -16,6 +16,7 @@ from daq.journal import Journal, read_journal
 from daq.lockin import free_cycle
 from daq.plan import Condition, Plan, default_plan, integer_bin, parse_plan, read_plan
 from daq.store import RunStore
+from drivers.errors import InterlockOpen
 from drivers.types import OutputLimits
 from identify.load import load_campaign
 from simulated_rig.build import build_rig
@@ -139,6 +140,44 @@ def test_stop_and_skip(store: RunStore) -> None:
     assert (result.status, result.reason) == ("stopped", "enough")
     assert "skipped" in [outcome.status for outcome in result.outcomes]
     assert store.card(result.id).status == "stopped"
+
+
+@pytest.mark.parametrize("kind", ["started", "free", "condition", "window", "entrained"])
+def test_an_emergency_stop_that_people_gave_ends_it_wherever_it_falls(
+    kind: str, store: RunStore
+) -> None:
+    """The rig refuses output before the campaign has asked whether it shall end."""
+    stopped = False
+
+    def control() -> None:
+        if stopped:
+            raise StopRequested("emergency stop by test")
+
+    with build_rig(seed=1) as rig:
+
+        def pressed(event: Event) -> None:
+            nonlocal stopped
+            if event.kind == kind and not stopped:
+                stopped = True
+                rig.emergency_stop("red button")
+
+        result = run_campaign(rig, SMALL, store, pressed, control=control, campaign_id="one")
+        assert rig.status().output_v == 0.0
+    assert stopped
+    assert (result.status, result.reason) == ("stopped", "emergency stop by test")
+    assert store.card("one").status == "stopped"
+
+
+def test_an_emergency_stop_that_nobody_here_asked_for_fails(store: RunStore) -> None:
+    with build_rig(seed=1) as rig:
+
+        def pressed(event: Event) -> None:
+            if event.kind == "condition":
+                rig.emergency_stop("red button")
+
+        with pytest.raises(InterlockOpen, match="red button"):
+            run_campaign(rig, SMALL, store, pressed, control=lambda: None, campaign_id="one")
+    assert store.card("one").status == "failed"
 
 
 def test_resume_repeats_nothing_and_loses_nothing(store: RunStore) -> None:

@@ -15,8 +15,9 @@ from daq.designed import Design
 from daq.errors import InputError
 from daq.plan import Condition, Plan, parse_plan, read_plan
 from daq.records import Kind, RunSummary
-from daq.service import loop_work
+from daq.service import loop_work, rig_work
 from daq.service.jobs import Link
+from daq.service.laid import noted
 from daq.service.loop_work import RigSteps, turn
 from daq.service.rigs import SIMULATED, RigEntry, open_simulated
 from daq.store import RunStore
@@ -235,6 +236,27 @@ def test_a_loop_as_a_job_goes_on_with_the_options_that_it_began_with(
         )
     assert closed["ending"] == "stopped"
     assert [entry.options for entry in opened] == [{"noise_db": 60.0, **laid}]
+
+
+def test_a_campaign_as_a_job_goes_on_with_the_options_that_it_began_with(
+    store: RunStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[RigEntry] = []
+
+    def open_rig(entry: RigEntry) -> DuplexRig:
+        opened.append(entry)
+        return open_simulated(entry)
+
+    monkeypatch.setattr(rig_work, "open_rig", open_rig)
+    at_once = replace(SMALL, limits=(Limit("p1", high=1e-6, action="end"),))
+    with open_simulated(RigEntry("tube", SIMULATED, {"seed": 5})) as rig:
+        run_campaign(rig, at_once, store, campaign_id="one", notes=noted({"seed": 5}))
+    ours, theirs = Pipe()
+    with ours, theirs:
+        tube = asdict(RigEntry("tube", SIMULATED, {"noise_db": 60.0}))
+        found = rig_work.campaign(Link(theirs), tube, str(store.root), {}, "one", resume=True)
+    assert found["status"] == "stopped"
+    assert [entry.options for entry in opened] == [{"noise_db": 60.0, "seed": 5}]
 
 
 def test_a_doubted_run_is_recorded_once_more_on_the_rig(store: RunStore) -> None:

@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import httpx
@@ -185,8 +186,9 @@ def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> N
     assert client.get(f"/jobs/{number}/result").json()["status"] == "stopped"
     assert client.get(f"/campaigns/{campaign}").json()["status"] == "stopped"
     assert client.post(f"/jobs/{number}/stop", headers=mine).status_code == 409
-    # The plan and the rig's name are the campaign's own; a quicker rig may go on with it.
-    server.service.rigs._rigs["slow"] = server.service.rigs._rigs["quick"]
+    # The plan and the rig's name are the campaign's own; configured anew, quicker, it goes on.
+    quick = server.service.rigs._rigs["quick"]
+    server.service.rigs._rigs["slow"] = replace(quick, name="slow")
     again = client.post(f"/campaigns/{campaign}/resume", headers=mine).json()
     until(client, again["id"], ended)
     detail = client.get(f"/campaigns/{campaign}").json()

@@ -1,9 +1,7 @@
 """The closed loop on a rig that is open: what `daq.closeloop` asks for, done with the run store.
 
 Everything a loop leaves lies in the store: its campaigns, in each one's folder the diagnosis
-(`diagnosis.json`), and in the first one's the account of the whole (`loop.json`). Options that were
-laid over the configured rig's (a simulated one's seed, or seal) stand in the campaigns' notes, so
-that a loop which is taken up again goes on with the same plant.
+(`diagnosis.json`), and in the first one's the account of the whole (`loop.json`).
 """
 
 import contextlib
@@ -13,9 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from daq.campaign import Event, SkipRequested, StopRequested, run_campaign
+from daq.campaign import Event, run_campaign
 from daq.closeloop import Budget, Closed, Recorded, Round, Steps, close_loop
-from daq.errors import InputError
 from daq.events import Control, OnEvent
 from daq.journal import read_journal
 from daq.plan import Plan, parse_plan
@@ -26,12 +23,14 @@ from daq.service.campaign_names import begun_with
 from daq.service.designing import resolved
 from daq.service.dry_run import dry_run
 from daq.service.jobs import Link
+from daq.service.laid import laid_over, noted
 from daq.service.observed import observe
 from daq.service.plain import plain
 from daq.service.rig_work import Helm, describe
 from daq.service.rigs import RigEntry, open_rig
 from daq.store import RunStore, write_json
 from daq.store_file import read_summary
+from daq.supervise import end_asked
 from drivers.protocols import DuplexRig
 from identify.diagnosis import diagnose
 from identify.load import load_campaign
@@ -40,14 +39,13 @@ from identify.results import Diagnosis
 from identify.trace import Cancelled
 
 Progress = Callable[[float, str], None]
-RIG_OPTIONS = "rig_options"  # in a card's notes
 
 
 class RigSteps:
     """`daq.closeloop.Steps` on an open rig and a store.
 
     `control` is heeded between windows and asked during a diagnosis: when it raises
-    `StopRequested`, the loop ends, and can go on later. `rig_options` are those of `laid_over`.
+    `StopRequested`, the loop ends, and can go on later. `rig_options` are as of `daq.service.laid`.
     """
 
     def __init__(
@@ -75,12 +73,6 @@ class RigSteps:
         return float(report["rig_seconds"])
 
     def record(self, campaign: str, plan: Plan) -> Recorded:
-        def heard(event: Event) -> None:
-            if event.kind == "started":
-                self._keep_options(campaign)
-            if self.on_event is not None:
-                self.on_event(event)
-
         begun = (self._store.campaigns_dir / campaign / "campaign.json").is_file()
         status, reason = "complete", ""
         if not begun or self._store.card(campaign).status != "complete":
@@ -88,10 +80,11 @@ class RigSteps:
                 self._rig,
                 plan,
                 self._store,
-                heard,
+                self.on_event,
                 control=self._control,
                 campaign=campaign if begun else None,
                 campaign_id="" if begun else campaign,
+                notes=noted(self._rig_options),
             )
             status, reason = result.status, result.reason
         lines = read_journal(self._store.campaign_dir(campaign) / "journal.jsonl")
@@ -115,48 +108,8 @@ class RigSteps:
         self._store.set_status(campaign, verdict=found.verdict)
         return answer
 
-    def _keep_options(self, campaign: str) -> None:
-        """At once, so that they are known however the campaign ends."""
-        card = self._store.card(campaign)
-        if RIG_OPTIONS not in card.notes:
-            notes = {**card.notes, RIG_OPTIONS: self._rig_options}
-            self._store.save_card(replace(card, notes=notes))
-
     def _cancelled(self) -> bool:
-        try:
-            self._control()
-        except StopRequested:
-            return True
-        except SkipRequested:  # there is no condition to leave out
-            pass
-        return False
-
-
-def laid_over(
-    rig: RigEntry, given: Mapping[str, Any], store: RunStore, loop: str | None
-) -> dict[str, Any]:
-    """The options to lay over the configured rig's: those `given`, or, to go on with `loop`, those
-    that it began with.
-
-    Raises `InputError` where what is given would make another rig of the one that it began with.
-    """
-    card = None if loop is None else store.card(loop)
-    if card is not None and card.rig not in ("", rig.name):
-        raise InputError(
-            f"rig={rig.name!r}: loop {loop!r} began on rig {card.rig!r}, and one analysis needs "
-            "one rig: leave --rig out, or begin a new loop"
-        )
-    if card is None or RIG_OPTIONS not in card.notes:
-        return dict(given)
-    kept = dict(card.notes[RIG_OPTIONS])
-    began = {**rig.options, **kept}
-    for key, value in given.items():
-        if began.get(key) != value:
-            raise InputError(
-                f"{key}={value!r}: loop {loop!r} began with {began.get(key, 'the default')!r}, and "
-                "one analysis needs one rig: leave --seed and --sealed out, or begin a new loop"
-            )
-    return kept
+        return end_asked(self._control) is not None  # there is no condition to skip
 
 
 def turn(

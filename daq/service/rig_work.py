@@ -8,7 +8,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,10 @@ from daq.campaign import (
 )
 from daq.plan import Plan, parse_plan
 from daq.service.jobs import Link
+from daq.service.laid import laid_over, noted
 from daq.service.observed import observe
 from daq.service.rigs import RigEntry, open_rig
 from daq.store import RunStore
-from drivers.errors import InterlockOpen
 from drivers.protocols import DuplexRig, EmergencyStop
 
 
@@ -109,27 +109,23 @@ def campaign(
     runs = RunStore(Path(store))
     with contextlib.closing(runs):
         wanted = _plan(plan, runs, campaign_id if resume else None, link.progress)
-        device = open_rig(RigEntry(**rig))
+        entry = RigEntry(**rig)
+        laid = laid_over(entry, {}, runs, campaign_id if resume else None)
+        device = open_rig(replace(entry, options={**entry.options, **laid}))
         with observe(device, link.event) as watched:
             helm = Helm(link, device)
             teller = _Teller(link, wanted)
-            try:
-                result = run_campaign(
-                    watched,
-                    wanted,
-                    runs,
-                    teller.tell,
-                    control=helm.heed,
-                    review=reviewer_of(wanted),
-                    campaign=campaign_id if resume else None,
-                    campaign_id="" if resume else campaign_id,
-                )
-            except InterlockOpen:
-                # An emergency stop can fall between two windows, while the controller drives.
-                if helm.ended is None:
-                    raise
-                runs.set_status(campaign_id, status="stopped")
-                return {"campaign": campaign_id, "status": "stopped", "reason": helm.ended}
+            result = run_campaign(
+                watched,
+                wanted,
+                runs,
+                teller.tell,
+                control=helm.heed,
+                review=reviewer_of(wanted),
+                campaign=campaign_id if resume else None,
+                campaign_id="" if resume else campaign_id,
+                notes=noted(laid),
+            )
         return summary(result)
 
 

@@ -92,6 +92,7 @@ def close_loop(
     from daq.errors import InputError
     from daq.service import loop_work
     from daq.service.campaign_names import begun_with, new_name
+    from daq.service.laid import laid_over
     from daq.service.rig_facts import truth
     from daq.service.rigs import SIMULATED, open_rig
 
@@ -115,7 +116,7 @@ def close_loop(
         entry = choose_rig(rig or (target.card(resume).rig if resume else None))
         if sealed and entry.driver != SIMULATED:
             raise InputError(f"--sealed: rig {entry.name!r} is not a simulated one")
-        laid = loop_work.laid_over(entry, given, target, resume)
+        laid = laid_over(entry, given, target, resume)
         entry = replace(entry, options={**entry.options, **laid})
         with open_rig(entry) as device, interruptible(stop):
             steps = loop_work.RigSteps(device, target, heed, rig_options=laid)

@@ -39,10 +39,8 @@ SeedOption = Annotated[int | None, typer.Option(help="Seed, for a simulated rig.
 RING_DOWN_S = 5.0  # a tube whose flame went out
 
 
-def choose_rig(name: str | None, seed: int | None = None) -> "RigEntry":
+def choose_rig(name: str | None) -> "RigEntry":
     """The configured rig of that name, or the only one."""
-    from dataclasses import replace
-
     from daq.service.rigs import Rigs
     from daq.service.settings import ConfigError, load
 
@@ -54,7 +52,7 @@ def choose_rig(name: str | None, seed: int | None = None) -> "RigEntry":
     entry = rigs.get(name) if name else None
     if entry is None:
         raise ConfigError(f"--rig={name!r} is not one of the configured rigs: {', '.join(names)}")
-    return entry if seed is None else replace(entry, options={**entry.options, "seed": seed})
+    return entry
 
 
 def read(plan: Path | None) -> "Plan":
@@ -83,7 +81,8 @@ def run(
     json_: JsonOption = None,
 ) -> None:
     """Run a campaign on a rig. Keys: p pauses, s skips, q or Ctrl-C ends; `resume` goes on."""
-    _campaign(ready(read(plan), store), choose_rig(rig, seed), store, None, json_)
+    given = {} if seed is None else {"seed": seed}
+    _campaign(ready(read(plan), store), choose_rig(rig), given, store, None, json_)
 
 
 def resume(
@@ -94,20 +93,15 @@ def resume(
     json_: JsonOption = None,
 ) -> None:
     """Go on with a campaign that was stopped or interrupted."""
-    from dataclasses import replace
-
     from daq.service.campaign_names import begun_with
-    from daq.service.loop_work import RIG_OPTIONS, laid_over
+    from daq.service.laid import laid_over
 
+    given = {} if seed is None else {"seed": seed}
     with open_store(store) as source:
         plan = begun_with(source, campaign)
-        card = source.card(campaign)
-        entry = choose_rig(rig or card.rig)
-        laid = {} if seed is None else {"seed": seed}
-        if RIG_OPTIONS in card.notes:  # a loop's: on the rig as that laid it out
-            laid = laid_over(entry, laid, source, campaign)
-        entry = replace(entry, options={**entry.options, **laid})
-    _campaign(plan, entry, store, campaign, json_)
+        entry = choose_rig(rig or source.card(campaign).rig)
+        laid = laid_over(entry, given, source, campaign)
+    _campaign(plan, entry, laid, store, campaign, json_)
 
 
 def rehearse(
@@ -242,10 +236,18 @@ class CampaignView:
 
 
 def _campaign(
-    plan: "Plan", entry: "RigEntry", store: Path | None, campaign: str | None, json_: Path | None
+    plan: "Plan",
+    entry: "RigEntry",
+    laid: "dict[str, Any]",
+    store: Path | None,
+    campaign: str | None,
+    json_: Path | None,
 ) -> None:
+    from dataclasses import replace
+
     from daq.campaign import run_campaign
     from daq.service.commands.keyboard import HELP, Keyboard, single_keys
+    from daq.service.laid import noted
     from daq.service.rig_work import reviewer_of, summary
     from daq.service.rigs import open_rig
 
@@ -253,7 +255,7 @@ def _campaign(
     quiet = str(json_) == "-"
     with (
         open_store(store) as target,
-        open_rig(entry) as device,
+        open_rig(replace(entry, options={**entry.options, **laid})) as device,
         interruptible(stop),
         single_keys() as typed,
         CampaignView(plan, quiet) as view,
@@ -268,6 +270,7 @@ def _campaign(
             control=Keyboard(device, typed, stop).heed,
             review=reviewer_of(plan),
             campaign=campaign,
+            notes=noted(laid),
         )
     write_json(json_, summary(result))
     if str(json_) != "-":
