@@ -66,6 +66,7 @@ FARTHEST = 300  # … by so many iterations more
 NEEDLESS = 100.0  # of χ²: what leaving an effect out adds at most, if it is to be left out
 REFORMED = 3  # sets of effects of which other forms are tried: the best one, and others …
 NEAR = 100.0  # … that leave no more than so much χ²/dof …
+VARIANTS = 3  # of the best set, in other forms, of which others are tried in turn
 BEHIND = 3.0  # … and, where forms of a better one explain the data, than so many times its χ²
 
 
@@ -395,6 +396,33 @@ def _in_all_forms(
         if best.explains or best.fit.chi2 >= current.fit.chi2 - EVIDENCE:
             break
         current = best
+    return out
+
+
+def varied(
+    tries: Sequence[Tried],
+    data: Dataset,
+    available: Sequence[Effect],
+    run: Executor,
+    done: set[tuple[str, ...]],
+) -> list[Tried]:
+    """Other forms of what the best set of several effects is in other forms, where that leaves
+    little too: which form of one does best depends on the form of the other."""
+    best = min((t for t in tries if len(t.effects) > 1), key=misfit, default=None)
+    if best is None or best.fit.chi2_per_dof > NEAR:
+        return []
+    near = [
+        t
+        for t in best_of_each_form([t for t in tries if t.key == best.key])
+        if t.fit.chi2 < BEHIND * best.fit.chi2 and t.key_of_forms not in done
+    ]
+    out: list[Tried] = []
+    for t in near[:VARIANTS]:
+        done.add(t.key_of_forms)
+        known = {o.key_of_forms for o in [*tries, *out] if o.fit.converged}
+        out += in_each_form(t, data, available, run, known)
+        if any(o.explains for o in out):
+            break
     return out
 
 

@@ -27,6 +27,7 @@ from identify.trace.contests import (
     runners_up,
     settled,
     suits,
+    varied,
     with_fewer,
 )
 from identify.trace.pairs import pairs_from_afar
@@ -129,8 +130,9 @@ def search(
             found = going.grown(parents, found)
         if size == 2:
             going.with_chance(parents)
-            far = base.chi2_per_dof > GROSS and _least(found) > MUCH
-            if far and not (nowhere or places):
+            # what was grown from may have been no part of the matter
+            lost = not going.explained or _least(found) > MUCH
+            if lost and base.chi2_per_dof > GROSS and not (nowhere or places):
                 found += going.pairs(singles)
         level = best_by_name(found)
         if size == 2 and not going.explained:
@@ -172,12 +174,13 @@ class _Searching:
 
     @property
     def explained(self) -> bool:
-        return any(t.explains for t in self.tried)
+        return any(t.explains for t in against_chance(self.tried))
 
     @property
     def accounted(self) -> bool:
         """Whether something explains the data that the misfit goes with, so that it may be said."""
-        return any(t.explains and accounts(t, self.declared, self.tried) for t in self.tried)
+        good = [t for t in against_chance(self.tried) if t.explains]
+        return any(accounts(t, self.declared, self.tried) for t in good)
 
     @cached_property
     def declared(self) -> Tried:
@@ -395,6 +398,8 @@ class _Searching:
         be, the foremost of what does not explain the data in other forms."""
         if not self.explained:
             self.tried += reformed(self.laws, self.data, self.forms, self.run, self.done)
+        if not self.explained:
+            self.tried += varied(self.laws, self.data, self.forms, self.run, self.done)
         self._contest()
         first = foremost([t for t in self.laws if t.plausible])
         if self.explained and not self.accounted and first is not None and not first.explains:
