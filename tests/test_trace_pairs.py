@@ -11,9 +11,11 @@ from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
-from identify.trace.contests import with_fewer
+from identify.trace.contests import NEAR, varied, with_fewer
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place
+from identify.trace.stages import renamed
+from identify.trace.tried import tried
 from tests.trace_material import fitted, search_for, thesis_campaign, tried_as
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
@@ -83,6 +85,30 @@ def test_an_offset_is_seen_in_a_further_mode_too(tmp_path: Path) -> None:
     ]
     assert all(t.fit.chi2 > 5 * best.fit.chi2 for t in without)
     assert not any(t.key_of_forms == ("sensor_offset:modal_3",) for t in tried)
+
+
+@pytest.mark.slow
+def test_the_best_pair_is_varied_from_each_of_its_forms(tmp_path: Path) -> None:
+    """A cubic amplifier beside a further mode: a search that was content with a form which has
+    had its turn goes on from the next, and says what it has seen to."""
+    mode, cubic = by_key("acoustic_mode:mode"), by_key("actuator_nonlinearity:cubic")
+    quadratic = by_key("actuator_nonlinearity:quadratic")
+    cubed = {"cubic_per_v2": 1e-3}
+    effects = {"acoustic_mode": THIRD_MODE, "actuator_nonlinearity/compression": cubed}
+    ready = thesis_campaign(tmp_path, 4, effects)
+    larger = ready.structure.with_effects(mode)
+    richer = start.fit_from_data(Structure(3), ready.data)
+    theta = renamed(mode, larger, Structure(3), [richer.theta])[0]
+    structure = larger.with_effects(quadratic)
+    fit = fit_orbits(structure, ready.data, np.r_[theta, quadratic.to_internal((0.0,))])
+    poor = tried(structure.effects, fit, ready.data)
+    assert not poor.adequate
+    assert poor.fit.chi2_per_dof < NEAR
+    done: set[tuple[str, ...]] = set()
+    found = varied([poor], ready.data, [mode, cubic, quadratic], InProcess(), done)
+    assert [t.explains for t in found if t.key_of_forms == (mode.key, cubic.key)] == [True]
+    assert done == {(mode.key, quadratic.key)}
+    assert varied([poor], ready.data, [mode, cubic, quadratic], InProcess(), done) == []
 
 
 def test_which_forms_stand_for_others() -> None:
