@@ -80,23 +80,34 @@ class RunStore:
         """
         created_at = utc_now()
         stem = id or f"{created_at[:19].replace(':', '')}-{slug(title)}"
-        new_id = stem
-        for attempt in range(2, 1000):
-            folder = self.campaigns_dir / new_id
-            if not (folder / "campaign.json").exists():
-                break
-            if id:
-                raise StoreError(f"campaign {id!r} exists in {self.root}")
-            new_id = f"{stem}-{attempt}"
         try:
+            folder = self._named(stem) if id else self._unnamed(stem)
             (folder / "runs").mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StoreError(f"{self.root}: cannot be written ({error})") from error
         for name, content in (documents or {}).items():
             write_json(folder / name, content)
-        made = CampaignCard(id=new_id, title=title, created_at=created_at, **card)
+        made = CampaignCard(id=folder.name, title=title, created_at=created_at, **card)
         self.save_card(made)
         return made
+
+    def _named(self, id: str) -> Path:
+        """The folder of that name, which has no campaign yet."""
+        folder = self.campaigns_dir / id
+        if (folder / "campaign.json").exists():
+            raise StoreError(f"campaign {id!r} exists in {self.root}")
+        return folder
+
+    def _unnamed(self, stem: str) -> Path:
+        """A folder of its own, whoever else makes one of that name at the same time."""
+        folder, attempt = self.campaigns_dir / stem, 1
+        while True:
+            try:
+                folder.mkdir(parents=True)
+                return folder
+            except FileExistsError:
+                attempt += 1
+                folder = self.campaigns_dir / f"{stem}-{attempt}"
 
     def save_card(self, card: CampaignCard) -> None:
         """Write a card (atomically) and index it."""

@@ -1,5 +1,6 @@
 """Run files: raw samples come back bit for bit, outcomes are honest, the catalogue is an index."""
 
+import contextlib
 import hashlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -152,6 +153,20 @@ def test_not_a_run_file(tmp_path: Path) -> None:
         read_summary(tmp_path / "other.h5", "c")
     with pytest.raises(CorruptFile, match="no such run file"):
         read_summary(tmp_path / "none.h5", "c")
+
+
+def test_campaigns_of_one_title_in_one_second_have_folders_of_their_own(tmp_path: Path) -> None:
+    """Two terminals that begin at the same time."""
+
+    def begin(_: int) -> str:
+        with contextlib.closing(RunStore(tmp_path / "store")) as store:
+            return store.create_campaign("tube").id
+
+    with ThreadPoolExecutor(8) as pool:
+        names = list(pool.map(begin, range(24)))
+    assert len(set(names)) == 24
+    with contextlib.closing(RunStore(tmp_path / "store")) as store:
+        assert {card.id for card in store.campaigns()} == set(names)
 
 
 def test_catalogue_is_rebuilt_from_the_files(tmp_path: Path) -> None:
