@@ -212,17 +212,24 @@ def _never() -> None:
     raise AssertionError("the rig was asked again")
 
 
-def test_a_loop_as_a_job_goes_on_with_the_options_that_it_began_with(
-    store: RunStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Begun with ``--sealed --seed 5`` in a terminal, taken up over REST, stopped both times."""
-    opened: list[RigEntry] = []
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch) -> list[RigEntry]:
+    """Every rig that a job opens."""
+    seen: list[RigEntry] = []
 
     def open_rig(entry: RigEntry) -> DuplexRig:
-        opened.append(entry)
+        seen.append(entry)
         return open_simulated(entry)
 
-    monkeypatch.setattr(loop_work, "open_rig", open_rig)
+    for module in (loop_work, rig_work):
+        monkeypatch.setattr(module, "open_rig", open_rig)
+    return seen
+
+
+def test_a_loop_as_a_job_goes_on_with_the_options_that_it_began_with(
+    store: RunStore, tmp_path: Path, opened: list[RigEntry]
+) -> None:
+    """Begun with ``--sealed --seed 5`` in a terminal, taken up over REST, stopped both times."""
     at_once = replace(SMALL, limits=(Limit("p1", high=1e-6, action="end"),))
     laid = {"seed": 5, "effects": "sealed"}
     with open_simulated(RigEntry("tube", SIMULATED, laid)) as rig:
@@ -239,15 +246,8 @@ def test_a_loop_as_a_job_goes_on_with_the_options_that_it_began_with(
 
 
 def test_a_campaign_as_a_job_goes_on_with_the_options_that_it_began_with(
-    store: RunStore, monkeypatch: pytest.MonkeyPatch
+    store: RunStore, opened: list[RigEntry]
 ) -> None:
-    opened: list[RigEntry] = []
-
-    def open_rig(entry: RigEntry) -> DuplexRig:
-        opened.append(entry)
-        return open_simulated(entry)
-
-    monkeypatch.setattr(rig_work, "open_rig", open_rig)
     at_once = replace(SMALL, limits=(Limit("p1", high=1e-6, action="end"),))
     with open_simulated(RigEntry("tube", SIMULATED, {"seed": 5})) as rig:
         run_campaign(rig, at_once, store, campaign_id="one", notes=noted({"seed": 5}))

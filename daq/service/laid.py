@@ -5,6 +5,7 @@ or over REST, goes on with the same plant.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from daq.errors import InputError
@@ -17,6 +18,11 @@ RIG_OPTIONS = "rig_options"  # in a card's notes
 def noted(options: Mapping[str, Any]) -> dict[str, Any]:
     """The notes of a card whose campaign begins with these options."""
     return {RIG_OPTIONS: dict(options)}
+
+
+def over(rig: RigEntry, laid: Mapping[str, Any]) -> RigEntry:
+    """The configured rig with these options laid over its own."""
+    return replace(rig, options={**rig.options, **laid})
 
 
 def laid_over(
@@ -36,7 +42,7 @@ def laid_over(
     if card is None or RIG_OPTIONS not in card.notes:
         return dict(given)
     kept = dict(card.notes[RIG_OPTIONS])
-    began = {**rig.options, **kept}
+    began = over(rig, kept).options
     for key, value in given.items():
         if began.get(key) != value:
             raise InputError(

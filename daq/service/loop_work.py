@@ -7,7 +7,6 @@ Everything a loop leaves lies in the store: its campaigns, in each one's folder 
 import contextlib
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,7 @@ from daq.service.campaign_names import begun_with
 from daq.service.designing import resolved
 from daq.service.dry_run import dry_run
 from daq.service.jobs import Link
-from daq.service.laid import laid_over, noted
+from daq.service.laid import laid_over, noted, over
 from daq.service.observed import observe
 from daq.service.plain import plain
 from daq.service.rig_work import Helm, describe
@@ -153,7 +152,7 @@ def work(
         entry = RigEntry(**rig)
         laid = laid_over(entry, {}, runs, name if resume else None)
         wanted = begun_with(runs, name) if resume else _ready(plan, runs, link)
-        device = open_rig(replace(entry, options={**entry.options, **laid}))
+        device = open_rig(over(entry, laid))
         with observe(device, link.event) as watched:
             helm = Helm(link, device)
             progress = Teller(link, budget)

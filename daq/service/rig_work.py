@@ -8,7 +8,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from daq.campaign import (
 )
 from daq.plan import Plan, parse_plan
 from daq.service.jobs import Link
-from daq.service.laid import laid_over, noted
+from daq.service.laid import laid_over, noted, over
 from daq.service.observed import observe
 from daq.service.rigs import RigEntry, open_rig
 from daq.store import RunStore
@@ -111,7 +111,7 @@ def campaign(
         wanted = _plan(plan, runs, campaign_id if resume else None, link.progress)
         entry = RigEntry(**rig)
         laid = laid_over(entry, {}, runs, campaign_id if resume else None)
-        device = open_rig(replace(entry, options={**entry.options, **laid}))
+        device = open_rig(over(entry, laid))
         with observe(device, link.event) as watched:
             helm = Helm(link, device)
             teller = _Teller(link, wanted)

@@ -1,6 +1,5 @@
 """`entrain close-loop`: campaign, diagnosis, next experiment, and again, in this terminal."""
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -92,7 +91,7 @@ def close_loop(
     from daq.errors import InputError
     from daq.service import loop_work
     from daq.service.campaign_names import begun_with, new_name
-    from daq.service.laid import laid_over
+    from daq.service.laid import laid_over, over
     from daq.service.rig_facts import truth
     from daq.service.rigs import SIMULATED, open_rig
 
@@ -117,7 +116,7 @@ def close_loop(
         if sealed and entry.driver != SIMULATED:
             raise InputError(f"--sealed: rig {entry.name!r} is not a simulated one")
         laid = laid_over(entry, given, target, resume)
-        entry = replace(entry, options={**entry.options, **laid})
+        entry = over(entry, laid)
         with open_rig(entry) as device, interruptible(stop):
             steps = loop_work.RigSteps(device, target, heed, rig_options=laid)
             name = resume or new_name(first.title)

@@ -243,11 +243,9 @@ def _campaign(
     campaign: str | None,
     json_: Path | None,
 ) -> None:
-    from dataclasses import replace
-
     from daq.campaign import run_campaign
     from daq.service.commands.keyboard import HELP, Keyboard, single_keys
-    from daq.service.laid import noted
+    from daq.service.laid import noted, over
     from daq.service.rig_work import reviewer_of, summary
     from daq.service.rigs import open_rig
 
@@ -255,7 +253,7 @@ def _campaign(
     quiet = str(json_) == "-"
     with (
         open_store(store) as target,
-        open_rig(replace(entry, options={**entry.options, **laid})) as device,
+        open_rig(over(entry, laid)) as device,
         interruptible(stop),
         single_keys() as typed,
         CampaignView(plan, quiet) as view,
