@@ -232,6 +232,11 @@ class Effect:
             row.append(known.pop(at)[1])
         return [tuple(row)]
 
+    def apart_from(self, other: "Effect", values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """Starting values of a form that refines another, from what that has come to, with which
+        it responds otherwise: in a valley of its own, which no descent from `starts_from` finds."""
+        return []
+
     def neutral(self) -> tuple[float, ...] | None:
         """Values at which the effect vanishes, where a score test can be taken; None: nowhere."""
         return None

@@ -27,7 +27,7 @@ from identify.trace.contests import (
     reformed,
 )
 from identify.trace.scores import scan, stepped
-from identify.trace.stages import known_sizes
+from identify.trace.stages import known_sizes, slow_flow_starts
 from identify.trace.tried import tried
 from simulated_rig.campaigns import RecordedRun
 from simulated_rig.effects import make_effect
@@ -354,6 +354,36 @@ def test_a_strong_resonator_with_its_mouth_near_a_node_of_the_singing_mode(tmp_p
     assert abs(values["acoustic_mode.mouth2"]) > 30 * abs(values["acoustic_mode.mouth1"])
     frequency = found.estimates["acoustic_mode.frequency_hz"]
     assert abs(frequency.value - size["frequency_hz"]) < 4 * frequency.stderr
+
+
+def test_a_resonator_felt_oppositely_by_the_second_mode(tmp_path: Path) -> None:
+    """Its mouth lies where the two modes have opposite signs, between which no descent passes."""
+    size = {"frequency_hz": 319.58, "damping": 0.031235, "coupling": 0.039238}
+    rig = random_rig(37147, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    effects = [make_effect("side_resonator", size)]
+    ready = record(tmp_path, 37147, rig, effects, forced=10, validation=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    alone = only(ready, base, "acoustic_mode:side_resonator_mode")
+    on_all = next(e for e in CATALOGUE if isinstance(e, SideResonator) and e.count == 2)
+    (found,) = in_each_form(alone, ready.data, [on_all], InProcess())
+    assert found.explains
+    values = found.fit.values
+    assert values["acoustic_mode.mouth1"] * values["acoustic_mode.mouth2"] < 0
+    assert found.fit.chi2_per_dof < 1.15  # 1.33 down the valley of equal signs
+
+
+def test_from_afar_the_flame_drives_a_further_mode_either_way(tmp_path: Path) -> None:
+    """A residue does not come through zero on its way down: either sign is started from, of each of
+    the effect's own values, and the true one is among what is led on."""
+    ready = thesis_campaign(tmp_path, 5, {"actuator_dynamics/delay": {"delay_s": 4e-4}})
+    base = start.fit_from_data(ready.structure, ready.data)
+    delay = by_key("actuator_dynamics:delay")
+    larger, rows = ready.structure.with_effects(delay), delay.starts(known_sizes(ready.data, base))
+    starts = slow_flow_starts(larger, ready.data.coarse(), rows, ((1.9,),))
+    index = larger.parameters.index
+    own, residue = index["actuator_dynamics.delay_s"], index["mode2.flame_residue"]
+    kinds = {(round(s.theta[own], 9), bool(s.theta[residue] > 0)) for s in starts}
+    assert len(kinds) == len(starts) == 2 * len(rows)
 
 
 def test_a_resonator_takes_energy_from_every_mode() -> None:

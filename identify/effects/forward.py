@@ -216,6 +216,16 @@ class SideResonator(_Resonator):
         found = self.of_a_mode(other, values)
         return [(f, zeta, *(np.sqrt(abs(load)) * q), *ones) for f, zeta, load, q in found]
 
+    def apart_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """With the mouth where other modes are as large as the singing one, some of them opposite:
+        the way from one sign to the other is barred where nothing is felt."""
+        if not isinstance(other, SideResonatorOfMode):
+            return []
+        f, zeta, coupling = (values[q.name] for q in other.parameters)
+        mouth, ones = np.sqrt(max(coupling, 1e-6)), (1.0,) * len(self.ratios)
+        signs = list(product((1.0, -1.0), repeat=self.count - 1))[1:]
+        return [(f, zeta, mouth, *(mouth * np.array(q)).tolist(), *ones) for q in signs]
+
     def coupled(self, p: Values) -> tuple[list[Any], list[Any]]:
         felt = [p[q.name] for q in self.felt]
         ratios = [p[q.name] for q in self.ratios]

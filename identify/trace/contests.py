@@ -250,7 +250,9 @@ def _in_form(item: _Exchange) -> Fit | None:
     taken = [start(row, values) for values in known for row in form.starts_from(old, values)]
     if form.refines:
         alike = [matched(larger, row, t.fit, data) for row in taken]
-        return _refined(larger, data, [x for x in alike if x is not None], t.fit.chi2)
+        apart = [] if kept else form.apart_from(old, t.fit.values)
+        valleys = [x for x in alike if x is not None], [start(row, t.fit.values) for row in apart]
+        return _refined(larger, data, valleys, t.fit.chi2)
     rows = [start(row, t.fit.values) for row in form.starts(known_sizes(data, t.fit))]
     if form.location == old.location and form.location in MOVING:
         moving = MOVING[form.location]
@@ -269,12 +271,12 @@ def _in_form(item: _Exchange) -> Fit | None:
 
 
 def _refined(
-    larger: Structure, data: Dataset, thetas: Sequence[FloatArray], coarser: float
+    larger: Structure, data: Dataset, valleys: Sequence[Sequence[FloatArray]], coarser: float
 ) -> Fit | None:
-    """The fit from the nearest of `thetas`, down long valleys as far as the noise tells, where that
-    comes below the χ² of the form that it refines, `coarser`."""
+    """The fit from the nearest of each of the `valleys`, down these as far as the noise tells,
+    where that comes below the χ² of the form that it refines, `coarser`."""
     fits: list[Fit] = []
-    for begun in coarse(larger, data, thetas)[:NEAREST]:
+    for begun in (s for starts in valleys for s in coarse(larger, data, starts)[:NEAREST]):
         fit = fit_orbits(larger, data, begun.theta, continuation=(0.003, 0.0), iterations=FARTHEST)
         misfits = assess.lack_of_fit_p(fit.chi2, fit.dof) < ALPHA
         if misfits and fit.chi2 < coarser and not fit.converged:

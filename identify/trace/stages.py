@@ -157,12 +157,23 @@ def _first_stage(task: _Task) -> list[CoarseStart]:
     return polish(larger, task.seen, starts, (first,), 8)[:3]
 
 
+def slow_flow_starts(
+    structure: Structure,
+    data: Dataset,
+    rows: Sequence[Sequence[float]],
+    placements: Sequence[tuple[float, ...]],
+) -> list[CoarseStart]:
+    """The slow flow's starts, with flame residues of either sign in the modes that do not sing."""
+    begin = physical_starts if structure.mode_count == 1 else signed_starts
+    return begin(structure, data, rows, placements)
+
+
 def _from_afar(task: _Task) -> list[CoarseStart]:
     """The same from the slow flow corrected for the effect, wherever the base fit is."""
     larger = task.structure.with_effects(task.effect)
     inherited = [task.base.values[q.name] for e in task.structure.effects for q in e.parameters]
     rows = [[*inherited, *row] for row in task.proposals]
-    every = physical_starts(larger, task.rough, rows, task.placements)
+    every = slow_flow_starts(larger, task.rough, rows, task.placements)
     # the best, and the best of each of the effect's own: coarse noise tells those apart badly
     inner = len(task.base.theta)
     of_each = list(first_of_each(every, lambda s: s.theta[inner:].tobytes()).values())
@@ -353,7 +364,7 @@ def try_effects(
             both = sorted([*staged[i][1], *starts], key=lambda s: s.cost)[:3]
             staged[i] = (tasks[i], both)
             progress(0.3 + done / len(led) * 0.2, f"trying {tasks[i].effect.key} from afar")
-        out += _refits(staged, out, data, executor, keep, progress)
+        out += _refits(staged, out, data, executor, keep, progress, each=True)
     return sorted(out, key=misfit)
 
 
@@ -368,6 +379,7 @@ def _refits(
     executor: Executor,
     keep: int,
     progress: Callable[[float, str], None],
+    each: bool = False,
 ) -> list[Tried]:
     """The staged starts led on, the best `keep` to the data's own noise, beside what came
     `straight` from the base fit."""
@@ -408,6 +420,11 @@ def _refits(
             if s and t.effect.name in names and t.effect.key not in done
         ]
         out += refit(rest, 0.95, 1.0)
+    # … and, of `each` other effect, the one that comes nearest: it ranks effects as badly
+    if each and not any(t.explains for t in (*straight, *out)):
+        seen = {t.effects[-1].name for t in (*straight, *out)}
+        nearest = _best(refined, len(refined), forms=1)
+        out += refit([item for item in nearest if item[0].effect.name not in seen], 0.95, 1.0)
     return out
 
 
