@@ -55,6 +55,7 @@ def diagnose(
     cancel: Callable[[], bool] | None = None,
     executor: Executor | None = None,
     catalogue: Sequence[Effect] = CANDIDATES,
+    within_s: float = np.inf,
 ) -> Diagnosis:
     """Fit the declared model, trace what it lacks, refit, and say so.
 
@@ -63,10 +64,12 @@ def diagnose(
     progress : called with (share done, what is being done).
     cancel : asked now and then; True raises `identify.trace.Cancelled`.
     catalogue : effects to consider.
+    within_s : seconds of search after which what explains the data is sought no further; the step
+        under way and what asks where the misfit lies come on top. What it costs is said.
 
     Raises what `identify.identification.prepare` raises for data that cannot be used.
     """
-    began = time.perf_counter()
+    began, until = time.perf_counter(), time.monotonic() + within_s
 
     def report(share: float, text: str) -> None:
         if cancel is not None and cancel():
@@ -84,6 +87,7 @@ def diagnose(
     declared = _declared(fit, ready, catalogue, run)
     tried: list[Tried] = []
     searched: tuple[Dataset, Fit, Sequence[Tried]] = data, declared.fit, ()
+    whole = True
     if declared.significant:
         found = trace.search(
             ready.structure,
@@ -93,7 +97,9 @@ def diagnose(
             progress=lambda share, text: report(0.15 + 0.8 * share, text),
             catalogue=catalogue,
             scores=declared.scores or None,
+            until=until,
         )
+        whole = found.whole
         tried, searched = list(found.tried), (data, declared.fit, found.pieces)
         known = [t for t in tried if t.plausible and t.fit.converged]
         if known and not any(t.adequate for t in tried):
@@ -160,6 +166,8 @@ def diagnose(
         if verdict == "unexplained":
             where = trace.whereabouts(asked, tried, base)
             explanation = f"{explanation} {where.words}"
+            if not whole:
+                explanation += f" Not all was tried within {within_s:g} s: allow the search longer."
     if tones and verdict in ("no_discrepancy", "traced"):
         verdict = "traced"
         explanation += " A foreign tone stands in the channels of most runs."

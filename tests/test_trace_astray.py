@@ -410,3 +410,24 @@ def test_a_lag_of_the_sound_is_one_of_the_record(tmp_path: Path) -> None:
     by = {t.effects[0].key: t for t in found}
     assert by["actuator_dynamics:pole"].explains
     assert trace.rivals(lowpass, list(by.values()))
+
+
+def test_a_search_that_runs_out_of_time_keeps_what_it_found(tmp_path: Path) -> None:
+    """No step that seeks begins after the limit; what explains the data by then is contested."""
+    ready, base = recorded(tmp_path, 5, "flame_delay", delay_s=2e-4)
+    gain, delay = by_key("channel_mismatch:gain"), by_key("flame_delay")
+    late = trace.search(ready.structure, ready.data, base, catalogue=[gain], until=0.0)
+    assert not late.whole
+    assert all(len(t.effects) == 1 for t in late.tried)
+    found = trace.search(ready.structure, ready.data, base, catalogue=[gain, delay], until=0.0)
+    assert found.whole
+    assert any(t.explains and t.key == ("flame_delay",) for t in found.tried)
+
+
+@pytest.mark.slow
+def test_a_diagnosis_that_runs_out_of_time_says_so(tmp_path: Path) -> None:
+    late = campaign(tmp_path, 5, "flame_delay", delay_s=1e-3)
+    found = identify.diagnose(late, catalogue=[by_key("channel_mismatch:gain")], within_s=0.0)
+    assert found.verdict == "unexplained"
+    assert "Not all was tried within 0 s" in found.explanation
+    assert found.whereabouts is not None

@@ -1,5 +1,6 @@
 """The search: singles, run-to-run scatter, pairs and triples, and what contests them."""
 
+import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
@@ -81,6 +82,7 @@ class Search:
     tried: tuple[Tried, ...]
     singles: tuple[Tried, ...]
     pieces: tuple[Tried, ...] = ()  # freely shaped, where they were asked, best first
+    whole: bool = True  # False: ended by its time limit before all had been tried
 
 
 def search(
@@ -93,10 +95,13 @@ def search(
     catalogue: Sequence[Effect] = CANDIDATES,
     depth: int = 3,
     scores: Mapping[str, ScoreTest] | None = None,
+    until: float = np.inf,
 ) -> Search:
     """Forward selection of up to `depth` effects with backward elimination.
 
-    `scores` are the candidates' tests at the base fit, where they are known already.
+    `scores` are the candidates' tests at the base fit, where they are known already. No step that
+    seeks an explanation begins after `until` (`time.monotonic`); what has been found by then is
+    contested all the same.
     """
     going = _Searching(
         structure,
@@ -107,6 +112,7 @@ def search(
         tuple(e for e in catalogue if usable(e, data, structure)),
         _fuller(catalogue, data, structure),
         tuple(e for e in catalogue if isinstance(e, Scatter)),
+        until,
     )
     singles = going.alone(scores)
     level = best_by_name(singles)
@@ -121,6 +127,8 @@ def search(
         explaining = [t for t in going.tried if t.explains]
         if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
             break
+        if going.late:
+            break
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
@@ -128,21 +136,21 @@ def search(
         found = going.pairs(singles) if nowhere else []
         if not going.explained or not nowhere:
             found = going.grown(parents, found)
-        if size == 2:
+        if size == 2 and not going.late:
             going.with_chance(parents)
             # what was grown from may have been no part of the matter
             lost = not going.explained or _least(found) > MUCH
             if lost and base.chi2_per_dof > GROSS and not (nowhere or places):
                 found += going.pairs(singles)
         level = best_by_name(found)
-        if size == 2 and not going.explained:
+        if size == 2 and not (going.explained or going.late):
             level = [*going.of_more_modes(level), *level]
-    if not going.explained:
+    if not (going.explained or going.late):
         going.each_alone(scores)
     going.contest()
     everything = against_chance(going.tried)
     ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
-    return Search(ranked, tuple(singles), tuple(pieces))
+    return Search(ranked, tuple(singles), tuple(pieces), whole=going.explained or not going.late)
 
 
 @dataclass
@@ -157,10 +165,16 @@ class _Searching:
     available: tuple[Effect, ...]
     fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them
     scatters: tuple[Scatter, ...]
+    until: float = np.inf
     tried: list[Tried] = field(default_factory=list)
     extended: dict[tuple[str, ...], float] = field(default_factory=dict)  # grown from, χ² there …
     done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
     found: set[tuple[str, ...]] = field(default_factory=set)  # alone, beside all other effects
+
+    @property
+    def late(self) -> bool:
+        """Whether no more than what has been found is to be looked at."""
+        return time.monotonic() > self.until
 
     @property
     def apart(self) -> list[Effect]:
@@ -295,7 +309,7 @@ class _Searching:
 
     def _in_other_forms(self, found: Sequence[Tried]) -> list[Tried]:
         """Other forms of the best of `found`, if nothing explains the data."""
-        if self.by_chance or any(t.explains for t in found):
+        if self.late or self.by_chance or any(t.explains for t in found):
             return []
         self.report(0.6, "trying other forms of the best")
         others = reformed(found, self.data, self.forms, self.run, self.done)
@@ -329,7 +343,8 @@ class _Searching:
             (LAW_SOFTENED, self._law_from_softened),
         ):
             for share in shares:
-                if not self.explained and _least(self.laws) > MUCH:  # a spread always comes near
+                # a spread always comes near
+                if not (self.explained or self.late) and _least(self.laws) > MUCH:
                     self.report(0.6, f"looking at the data to within {share:.1%}")
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
@@ -396,10 +411,9 @@ class _Searching:
     def contest(self) -> None:
         """What might do as well as the best is tried before it is claimed, and, where nothing can
         be, the foremost of what does not explain the data in other forms."""
-        if not self.explained:
-            self.tried += reformed(self.laws, self.data, self.forms, self.run, self.done)
-        if not self.explained:
-            self.tried += varied(self.laws, self.data, self.forms, self.run, self.done)
+        for seek in (reformed, varied):
+            if not (self.explained or self.late):
+                self.tried += seek(self.laws, self.data, self.forms, self.run, self.done)
         self._contest()
         first = foremost([t for t in self.laws if t.plausible])
         if self.explained and not self.accounted and first is not None and not first.explains:

@@ -132,6 +132,10 @@ def diagnose(
     store: StoreOption = None,
     processes: ProcessesOption = 0,
     operating_point: PointOption = None,
+    within: Annotated[
+        float,
+        typer.Option(min=0.1, help="Minutes after which the search for a cause goes no further."),
+    ] = 10.0,
 ) -> None:
     """Trace what the declared model lacks: verdict, effect, error before and after."""
     from daq.importers.broadband import is_broadband
@@ -155,7 +159,7 @@ def diagnose(
     recorded, steps = load(campaign, store, operating_point)
     quiet = str(json_) == "-"
     with executor(processes) as workers, progress_bar(quiet) as tell:
-        found = run(recorded, progress=tell, executor=workers)
+        found = run(recorded, progress=tell, executor=workers, within_s=60 * within)
     if not quiet:
         show_diagnosis(found)
         show_calibration(recorded)
