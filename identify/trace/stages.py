@@ -420,7 +420,7 @@ def _refits(
             if s and t.effect.name in names and t.effect.key not in done
         ]
         out += refit(rest, 0.95, 1.0)
-    # … and, of `each` other effect, the one that comes nearest: it ranks effects as badly
+    # … and the nearest form of `each` other effect: coarse noise ranks effects as badly as forms
     if each and not any(t.explains for t in (*straight, *out)):
         seen = {t.effects[-1].name for t in (*straight, *out)}
         nearest = _best(refined, len(refined), forms=1)
