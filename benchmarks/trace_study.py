@@ -245,7 +245,7 @@ def deviations(r: dict[str, Any]) -> list[tuple[str, float]]:
         return []
     truth, claim = r["truth"][0], r["claimed"][0]
     rules = COMPARED.get((claim["effect"], claim["form"], truth["variant"]), {})
-    if claim["effect"] != truth["effect"]:
+    if claim["effect"] != truth["effect"] or not rules:
         return []
     last_s = r.get("last_s", 120.0 * (r["runs"] - 1))
     found = {name: claim["parameters"][f"{claim['effect']}.{name}"] for name in rules}
