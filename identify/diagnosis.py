@@ -64,12 +64,12 @@ def diagnose(
     progress : called with (share done, what is being done).
     cancel : asked now and then; True raises `identify.trace.Cancelled`.
     catalogue : effects to consider.
-    within_s : seconds of search after which what explains the data is sought no further; the step
-        under way and what asks where the misfit lies come on top. What it costs is said.
+    within_s : seconds after which no further step that seeks an explanation begins; the one under
+        way and the question where the misfit lies come on top. `unexplained` says so then.
 
     Raises what `identify.identification.prepare` raises for data that cannot be used.
     """
-    began, until = time.perf_counter(), time.monotonic() + within_s
+    began = time.monotonic()
 
     def report(share: float, text: str) -> None:
         if cancel is not None and cancel():
@@ -97,7 +97,7 @@ def diagnose(
             progress=lambda share, text: report(0.15 + 0.8 * share, text),
             catalogue=catalogue,
             scores=declared.scores or None,
-            until=until,
+            until=began + within_s,
         )
         whole = found.whole
         tried, searched = list(found.tried), (data, declared.fit, found.pieces)
@@ -189,7 +189,7 @@ def diagnose(
         effects=effects,
         after=after,
         next_experiment=next_experiment,
-        seconds=time.perf_counter() - began,
+        seconds=time.monotonic() - began,
         explanation=explanation,
         whereabouts=where,
     )

@@ -373,8 +373,8 @@ def test_a_resonator_felt_oppositely_by_the_second_mode(tmp_path: Path) -> None:
 
 
 def test_from_afar_the_flame_drives_a_further_mode_either_way(tmp_path: Path) -> None:
-    """A residue does not come through zero on its way down: either sign is started from, of each of
-    the effect's own values, and the true one is among what is led on."""
+    """A residue does not come through zero on its way down: either sign is started from, with each
+    of the effect's own values."""
     ready = thesis_campaign(tmp_path, 5, {"actuator_dynamics/delay": {"delay_s": 4e-4}})
     base = start.fit_from_data(ready.structure, ready.data)
     delay = by_key("actuator_dynamics:delay")

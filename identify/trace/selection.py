@@ -125,9 +125,8 @@ def search(
     for size in range(2, depth + 1):
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
-        if any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining):
-            break
-        if going.late:
+        enough = any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining)
+        if enough or going.late:
             break
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
@@ -143,9 +142,9 @@ def search(
             if lost and base.chi2_per_dof > GROSS and not (nowhere or places):
                 found += going.pairs(singles)
         level = best_by_name(found)
-        if size == 2 and not (going.explained or going.late):
+        if size == 2 and going.seeking:
             level = [*going.of_more_modes(level), *level]
-    if not (going.explained or going.late):
+    if going.seeking:
         going.each_alone(scores)
     going.contest()
     everything = against_chance(going.tried)
@@ -175,6 +174,11 @@ class _Searching:
     def late(self) -> bool:
         """Whether no more than what has been found is to be looked at."""
         return time.monotonic() > self.until
+
+    @property
+    def seeking(self) -> bool:
+        """Whether nothing explains the data yet, and there is time to go on."""
+        return not (self.explained or self.late)
 
     @property
     def apart(self) -> list[Effect]:
@@ -344,7 +348,7 @@ class _Searching:
         ):
             for share in shares:
                 # a spread always comes near
-                if not (self.explained or self.late) and _least(self.laws) > MUCH:
+                if self.seeking and _least(self.laws) > MUCH:
                     self.report(0.6, f"looking at the data to within {share:.1%}")
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
@@ -412,7 +416,7 @@ class _Searching:
         """What might do as well as the best is tried before it is claimed, and, where nothing can
         be, the foremost of what does not explain the data in other forms."""
         for seek in (reformed, varied):
-            if not (self.explained or self.late):
+            if self.seeking:
                 self.tried += seek(self.laws, self.data, self.forms, self.run, self.done)
         self._contest()
         first = foremost([t for t in self.laws if t.plausible])
