@@ -67,15 +67,22 @@ def diagnose(
     within_s : seconds after which no further step that seeks an explanation begins; the one under
         way and the question where the misfit lies come on top. `unexplained` says so then.
 
-    Raises what `identify.identification.prepare` raises for data that cannot be used.
+    Raises
+    ------
+    ValueError : `within_s` is not above zero.
+    What `identify.identification.prepare` raises for data that cannot be used.
     """
-    began = time.monotonic()
+    if not within_s > 0:
+        raise ValueError(f"within_s={within_s!r} is not a number of seconds > 0")
+    began, done = time.monotonic(), 0.0
 
     def report(share: float, text: str) -> None:
+        nonlocal done
         if cancel is not None and cancel():
             raise Cancelled("the diagnosis was cancelled by its caller")
+        done = max(done, share)  # a step that comes again is none back
         if progress is not None:
-            progress(share, text)
+            progress(done, text)
 
     report(0.0, "measuring harmonics")
     ready = prepare(campaign, structure)

@@ -424,10 +424,16 @@ def test_a_search_that_runs_out_of_time_keeps_what_it_found(tmp_path: Path) -> N
     assert any(t.explains and t.key == ("flame_delay",) for t in found.tried)
 
 
+@pytest.mark.parametrize("within_s", [0.0, -1.0, float("nan")])
+def test_a_limit_of_time_is_above_zero(tmp_path: Path, within_s: float) -> None:
+    with pytest.raises(ValueError, match="within_s=.* > 0"):
+        identify.diagnose(campaign(tmp_path, 5, ""), within_s=within_s)
+
+
 @pytest.mark.slow
 def test_a_diagnosis_that_runs_out_of_time_says_so(tmp_path: Path) -> None:
     late = campaign(tmp_path, 5, "flame_delay", delay_s=1e-3)
-    found = identify.diagnose(late, catalogue=[by_key("channel_mismatch:gain")], within_s=0.0)
+    found = identify.diagnose(late, catalogue=[by_key("channel_mismatch:gain")], within_s=1e-3)
     assert found.verdict == "unexplained"
-    assert "Not all was tried within 0 s" in found.explanation
+    assert "Not all was tried within 0.001 s" in found.explanation
     assert found.whereabouts is not None

@@ -66,6 +66,7 @@ FOREMOST, FORMS = 2, 4  # laws seen there beside which chance is tried, and form
 ALIKE = 1.05  # … that leave no more than so many times the least
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought, and chance, from afar
+NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
@@ -149,7 +150,7 @@ def search(
     going.contest()
     everything = against_chance(going.tried)
     ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
-    return Search(ranked, tuple(singles), tuple(pieces), whole=going.explained or not going.late)
+    return Search(ranked, tuple(singles), tuple(pieces), whole=not going.left_out)
 
 
 @dataclass
@@ -165,6 +166,7 @@ class _Searching:
     fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them
     scatters: tuple[Scatter, ...]
     until: float = np.inf
+    left_out: bool = False  # a step, for want of time
     tried: list[Tried] = field(default_factory=list)
     extended: dict[tuple[str, ...], float] = field(default_factory=dict)  # grown from, χ² there …
     done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
@@ -172,8 +174,11 @@ class _Searching:
 
     @property
     def late(self) -> bool:
-        """Whether no more than what has been found is to be looked at."""
-        return time.monotonic() > self.until
+        """Whether no more than what has been found is to be looked at; asked before each step that
+        seeks an explanation, which is left out then."""
+        if time.monotonic() > self.until:
+            self.left_out = True
+        return self.left_out
 
     @property
     def seeking(self) -> bool:
@@ -290,7 +295,8 @@ class _Searching:
         if far and not any(t.adequate for t in grown):
             grown = started_again(grown, self.data, self.run)
         grown += led_on(grown, self.data, self.run)
-        grown += self._in_other_forms([*grown, *afar])
+        if _least([*grown, *afar]) <= max(GROSS, NOWHERE * self.base.chi2_per_dof):
+            grown += self._in_other_forms([*grown, *afar])
         # what leaves a misfit is no better for having less in it; the best are shown without
         best = best_by_name(grown)[:SHORTENED]
         for t in grown:
@@ -313,7 +319,7 @@ class _Searching:
 
     def _in_other_forms(self, found: Sequence[Tried]) -> list[Tried]:
         """Other forms of the best of `found`, if nothing explains the data."""
-        if self.late or self.by_chance or any(t.explains for t in found):
+        if self.by_chance or any(t.explains for t in found) or self.late:
             return []
         self.report(0.6, "trying other forms of the best")
         others = reformed(found, self.data, self.forms, self.run, self.done)
