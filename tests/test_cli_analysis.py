@@ -35,6 +35,28 @@ def test_a_place_that_cannot_be_written_is_refused_before_the_work(
         assert says in " ".join(err.replace("│", " ").split())
 
 
+@pytest.mark.parametrize("minutes", ["0", "-1", "nan"])
+def test_a_limit_of_time_that_is_none_is_refused(
+    home: Path, capfd: pytest.CaptureFixture[str], minutes: str
+) -> None:
+    case = Path(__file__).parent / "data" / "b-flame-delay"
+    code, out, err = entrain(capfd, "diagnose", case, "--within", minutes)
+    assert (code, out) == (2, "")
+    assert "minutes above zero" in err
+
+
+def test_a_broadband_search_takes_no_limit_of_time(
+    home: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It had been taken, and not kept to."""
+    folder = home / "shaken"
+    folder.mkdir()
+    (folder / "campaign.toml").write_text("[excitation]\n", "utf-8")
+    code, out, err = entrain(capfd, "diagnose", folder, "--within", "5")
+    assert (code, out) == (2, "")
+    assert "within=5: a broadband search has no limit" in " ".join(err.split())
+
+
 def test_the_signal_that_is_characterised_is_the_one_drawn(
     home: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ from typing import Any
 
 from daq.importers import import_folder, import_recordings
 from daq.journal import read_journal
+from daq.service import LONGEST_SEARCH_S
 from daq.service.curves import comparisons, curves
 from daq.service.jobs import Link
 from daq.service.unpack import unpack
@@ -71,7 +72,7 @@ def diagnosis(link: Link, campaign: str, store: str, report: str) -> dict[str, A
 
     recorded, target = _open(campaign, store)
     try:
-        found = diagnose(recorded, progress=link.progress)
+        found = diagnose(recorded, progress=link.progress, within_s=LONGEST_SEARCH_S)
         target.set_status(campaign, verdict=found.verdict)
     finally:
         target.close()

@@ -14,6 +14,7 @@ from daq.designed import Design
 from daq.errors import InputError
 from daq.plan import Condition, Plan
 from daq.schedule import expand
+from daq.service import LONGEST_SEARCH_S
 from daq.store import RunStore
 from identify import design
 from identify.diagnosis import diagnose
@@ -129,7 +130,7 @@ def _sharpened(plan: Plan, campaign: Campaign, progress: Progress | None) -> dic
 def _told_apart(plan: Plan, campaign: Campaign, progress: Progress | None) -> dict[str, Any]:
     assert plan.design is not None
     if not plan.design.rivals:
-        found = diagnose(campaign, progress=progress).to_json()
+        found = diagnose(campaign, progress=progress, within_s=LONGEST_SEARCH_S).to_json()
         if found["next_experiment"] is None:
             raise ValueError(f"its diagnosis proposes no experiment. {found['explanation']}")
         return _proposed(found["next_experiment"], plan.design)

@@ -17,6 +17,7 @@ from daq.journal import read_journal
 from daq.plan import Plan, parse_plan
 from daq.records import RunSummary
 from daq.schedule import elapsed
+from daq.service import LONGEST_SEARCH_S
 from daq.service.analysis_work import steps_in
 from daq.service.campaign_names import begun_with
 from daq.service.designing import resolved
@@ -98,7 +99,12 @@ class RigSteps:
             return known
         recorded = load_campaign(folder)
         try:
-            found = diagnose(recorded, progress=self.progress, cancel=self._cancelled)
+            found = diagnose(
+                recorded,
+                progress=self.progress,
+                cancel=self._cancelled,
+                within_s=LONGEST_SEARCH_S,
+            )
         except Cancelled:
             return None
         self.last = found

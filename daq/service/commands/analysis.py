@@ -11,6 +11,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from daq.errors import InputError
+from daq.service import LONGEST_SEARCH_S
 from daq.service.commands import broadband
 from daq.service.commands.common import (
     HtmlOption,
@@ -133,9 +134,12 @@ def diagnose(
     processes: ProcessesOption = 0,
     operating_point: PointOption = None,
     within: Annotated[
-        float,
-        typer.Option(min=0.1, help="Minutes after which the search for a cause goes no further."),
-    ] = 10.0,
+        float | None,
+        typer.Option(
+            show_default=f"{LONGEST_SEARCH_S / 60:g}",
+            help="Minutes after which the search for a cause goes no further.",
+        ),
+    ] = None,
 ) -> None:
     """Trace what the declared model lacks: verdict, effect, error before and after."""
     from daq.importers.broadband import is_broadband
@@ -145,6 +149,8 @@ def diagnose(
             raise InputError(
                 f"operating_point={operating_point!r}: a broadband recording has none; leave it out"
             )
+        if within is not None:
+            raise InputError(f"within={within:g}: a broadband search has no limit; leave it out")
         with progress_bar(str(json_) == "-") as tell:
             traced = broadband.diagnose(campaign, tell)
         if str(json_) != "-":
@@ -156,10 +162,13 @@ def diagnose(
     from identify.diagnosis import diagnose as run
     from identify.executor import executor
 
+    within_s = LONGEST_SEARCH_S if within is None else 60 * within
+    if not within_s > 0:
+        raise InputError(f"within={within}: give a number of minutes above zero")
     recorded, steps = load(campaign, store, operating_point)
     quiet = str(json_) == "-"
     with executor(processes) as workers, progress_bar(quiet) as tell:
-        found = run(recorded, progress=tell, executor=workers, within_s=60 * within)
+        found = run(recorded, progress=tell, executor=workers, within_s=within_s)
     if not quiet:
         show_diagnosis(found)
         show_calibration(recorded)
