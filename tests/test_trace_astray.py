@@ -426,7 +426,7 @@ def test_a_search_that_runs_out_of_time_keeps_what_it_found(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("within_s", [0.0, -1.0, float("nan")])
 def test_a_limit_of_time_is_above_zero(tmp_path: Path, within_s: float) -> None:
-    with pytest.raises(ValueError, match="within_s=.* > 0"):
+    with pytest.raises(ValueError, match=r"within_s=.* > 0"):
         identify.diagnose(campaign(tmp_path, 5, ""), within_s=within_s)
 
 
