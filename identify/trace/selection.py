@@ -295,7 +295,9 @@ class _Searching:
         if far and not any(t.adequate for t in grown):
             grown = started_again(grown, self.data, self.run)
         grown += led_on(grown, self.data, self.run)
-        if _least([*grown, *afar]) <= max(GROSS, NOWHERE * self.base.chi2_per_dof):
+        # what comes near may have values that only its form makes implausible
+        near = min(t.fit.chi2_per_dof for t in (*grown, *afar))
+        if near <= max(GROSS, NOWHERE * self.base.chi2_per_dof):
             grown += self._in_other_forms([*grown, *afar])
         # what leaves a misfit is no better for having less in it; the best are shown without
         best = best_by_name(grown)[:SHORTENED]
