@@ -136,7 +136,7 @@ def test_what_a_diagnosis_proposes_is_cut_to_the_runs_and_minutes_of_the_design(
     forced: int,
     cold: int,
 ) -> None:
-    monkeypatch.setattr(designing, "diagnose", lambda campaign, progress: proposal(3, 2))
+    monkeypatch.setattr(designing, "diagnose", lambda campaign, progress, within_s: proposal(3, 2))
     table = {"campaign": known, "aim": "discrimination", **limits}
     found = designing.resolved(parse_plan({"design": table}), server.service.store)
     assert (len(found.conditions), len(found.cold)) == (forced, cold)
@@ -147,7 +147,7 @@ def test_a_diagnosis_without_a_proposal_says_why(
 ) -> None:
     found = {"next_experiment": None, "explanation": "Without run 3 it explains all others."}
     silent = SimpleNamespace(to_json=lambda: found)
-    monkeypatch.setattr(designing, "diagnose", lambda campaign, progress: silent)
+    monkeypatch.setattr(designing, "diagnose", lambda campaign, progress, within_s: silent)
     plan = parse_plan({"design": {"campaign": known, "aim": "discrimination"}})
     with pytest.raises(InputError, match=r"proposes no experiment\. Without run 3"):
         designing.resolved(plan, server.service.store)
