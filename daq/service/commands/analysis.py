@@ -137,7 +137,7 @@ def diagnose(
         float | None,
         typer.Option(
             show_default=f"{LONGEST_SEARCH_S / 60:g}",
-            help="Minutes after which the search for a cause goes no further.",
+            help="Minutes, 0.1 at least, after which the search for a cause goes no further.",
         ),
     ] = None,
 ) -> None:
@@ -162,9 +162,9 @@ def diagnose(
     from identify.diagnosis import diagnose as run
     from identify.executor import executor
 
+    if within is not None and not within >= 0.1:
+        raise InputError(f"within={within}: give a number of minutes above zero, 0.1 at least")
     within_s = LONGEST_SEARCH_S if within is None else 60 * within
-    if not within_s > 0:
-        raise InputError(f"within={within}: give a number of minutes above zero")
     recorded, steps = load(campaign, store, operating_point)
     quiet = str(json_) == "-"
     with executor(processes) as workers, progress_bar(quiet) as tell:

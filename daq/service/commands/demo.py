@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
+from daq.service import LONGEST_SEARCH_S
 from daq.service.commands.analysis import ProcessesOption, progress_bar, show_diagnosis
 from daq.service.commands.common import number, out, write_json
 
@@ -35,7 +36,7 @@ def demo(
     campaign = pipeline.load(recorded)
     out.print(f"stored {len(campaign.runs)} runs in {recorded.result.directory}", markup=False)
     with executor(processes) as workers, progress_bar(quiet=False) as tell:
-        found = diagnose(campaign, progress=tell, executor=workers)
+        found = diagnose(campaign, progress=tell, executor=workers, within_s=LONGEST_SEARCH_S)
     show_diagnosis(found)
     truth = recorded.sealed.reveal()
     show_truth(truth)
