@@ -88,9 +88,10 @@ def fit_scatter(
     base: Fit,
     scatter: Scatter,
     most: float = np.inf,
+    far: bool = False,
 ) -> Spread | None:
     """Fit `structure` with a scatter on top, from the fit `base` without it, and from the slow flow
-    where that one is no place to start from.
+    where that one is no place to start from, or is said to be `far`.
 
     None where there are too few runs, or no likelihood that is finite, or where χ² and penalty stay
     beyond `most`.
@@ -100,7 +101,7 @@ def fit_scatter(
         return None
     own = Own(scatter.directions, _reached(data.fit, scatter))
     starts = [np.concatenate([base.theta, np.zeros(len(own.parameters))])[None]]
-    if base.chi2_per_dof > ASTRAY:
+    if far or base.chi2_per_dof > ASTRAY:
         starts.append(_afar(structure, data, own, base))
     found = []
     for begin in starts:

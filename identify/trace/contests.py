@@ -457,6 +457,34 @@ def runners_up(
     return out
 
 
+def in_finer_forms(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """Other effects than the best that explain the data but are far less likely, in the forms that
+    refine theirs: what is coarse may have left what the finer form takes up."""
+    good = [t for t in tries if t.explains and t.spread is None]
+    if not good:
+        return []
+    best = best_form(good)
+    done = {t.key_of_forms for t in tries if t.adequate}
+    items = []
+    for t in best_by_name(good):
+        behind = t.key != best.key and not best.parts < t.parts
+        if not behind or t.evidence < best.evidence + EVIDENCE:
+            continue
+        for e in t.effects:
+            kept = tuple(o for o in t.effects if o is not e)
+            items += [
+                (t, kept, e, form, data)
+                for form in available
+                if form.name == e.name
+                and form.refines
+                and suits(form, t.fit.structure, kept)
+                and key_of_forms((*kept, form)) not in done
+            ]
+    return _refitted(items, data, run)
+
+
 def at_the_same_place(
     tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
 ) -> list[Tried]:

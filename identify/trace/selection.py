@@ -7,6 +7,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
+from identify.assess import lack_of_fit_p
 from identify.dataset import Dataset
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
@@ -19,6 +20,7 @@ from identify.trace.contests import (
     at_the_same_place,
     eliminate,
     in_each_form,
+    in_finer_forms,
     in_other_forms,
     in_their_places,
     joins,
@@ -42,6 +44,7 @@ from identify.trace.stages import (
     usable,
 )
 from identify.trace.tried import (
+    ALPHA,
     BEATEN,
     EVIDENCE,
     GROSS,
@@ -370,8 +373,10 @@ class _Searching:
     def _chance_from_softened(self, soft: Dataset, base: Fit) -> None:
         """An effect and chance that are both gross lead each other astray. Where noise of some
         share of every coefficient hides the lesser of them, the greater is found by itself: chance,
-        and a law within it; or (`_law_from_softened`) a law, and chance beside it."""
-        spreads = try_scatters(self.structure, soft, base, self.scatters, self.run)
+        and a law within it; or (`_law_from_softened`) a law, and chance beside it. What scatters
+        leads a fit without it astray however little it leaves then."""
+        far = lack_of_fit_p(base.chi2, base.dof) < ALPHA
+        spreads = try_scatters(self.structure, soft, base, self.scatters, self.run, far=far)
         found = _beside_chance(spreads, self.data, self.apart, self.run)
         found += _simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
@@ -446,6 +451,7 @@ class _Searching:
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
+        self.tried += in_finer_forms(self.tried, data, self.forms, run)
         self.tried += settled(self.tried, data, run)
 
 

@@ -519,11 +519,12 @@ def try_scatters(
     scatters: Sequence[Scatter],
     run: Executor,
     most: float = np.inf,
+    far: bool = False,
 ) -> list[Tried]:
     """Each kind of random difference from run to run on top of `structure`, but for those whose
-    evidence (χ² + p ln n) is surely beyond `most`."""
+    evidence (χ² + p ln n) is surely beyond `most`; from the slow flow too where `base` is `far`."""
     left = most - base.theta.size * float(np.log(data.residuals))  # of χ² and penalty
-    spreads = run.map(_scattered, [(structure, data, base, s, left) for s in scatters])
+    spreads = run.map(_scattered, [(structure, data, base, s, left, far) for s in scatters])
     return [
         replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
         for s, spread in zip(scatters, spreads, strict=True)
@@ -531,7 +532,7 @@ def try_scatters(
     ]
 
 
-def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float]) -> Spread | None:
+def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float, bool]) -> Spread | None:
     return fit_scatter(*item)
 
 
