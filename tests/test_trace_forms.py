@@ -1,6 +1,6 @@
 """Forms of effects that the simulated rig has no switch for: other hands would write them so."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -17,12 +17,12 @@ from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import Fit, OrbitResidual
+from identify.fit import Fit, OrbitResidual, soften
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.scatter import Spread, fit_scatter
-from identify.trace import selection, stages
+from identify.trace import contests, selection, stages
 from identify.trace.contests import at_the_same_place
 from identify.trace.stages import try_scatters
 from identify.trace.tried import BEATEN
@@ -35,6 +35,7 @@ from simulated_rig.campaigns import (
     write_campaign,
 )
 from simulated_rig.config import RigConfig
+from simulated_rig.effects import make_effect
 from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.test_identify_balance import forced_conditions
@@ -387,6 +388,58 @@ def test_beside_chance_a_law_s_forms_start_from_where_it_ended(
     going = searching(base, lambda share, text: None)
     going._law_from_softened(going.data, base)
     assert [t.fit for t in asked] == [loaded.fit, mode.fit]
+
+
+@pytest.mark.slow
+def test_what_wanders_is_sought_from_afar_where_a_fit_without_it_is_astray(tmp_path: Path) -> None:
+    """A frequency that walks: with a fiftieth of each coefficient for noise the declared model is
+    nearly right, in a minimum far from the truth (a walk beside a quintic law, 39012)."""
+    rig = random_rig(39012, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    made = [
+        make_effect("parameter_drift/frequency_walk", {"frequency_walk": 0.002123}),
+        make_effect("nonlinearity_shape/quintic", {"quintic_share": 0.0049021}),
+    ]
+    ready = record(tmp_path, 39012, rig, made, forced=9, validation=3, modes=1)
+    soft = replace(ready.data, fit=soften(ready.data.fit, 0.02))
+    base = start.fit_from_data(ready.structure, soft)
+    assert base.chi2_per_dof < 3.0
+    (walk,) = [s for s in SCATTERS if s.key == "parameter_drift:random"]
+    near, far = (
+        try_scatters(ready.structure, soft, base, [walk], InProcess(), far=far)
+        for far in (False, True)
+    )
+    assert near == []
+    assert far[0].fit_p > 0.1  # the held-out runs are no softer
+
+
+def test_what_is_far_less_likely_in_a_coarse_form_is_contested_in_a_finer_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A side resonator is one more mode to first order only (37058, where a late channel and a
+    sensor's lag were named instead)."""
+    asked: list[tuple[str, str]] = []
+
+    def refitted(items: Sequence[Any], data: Dataset, run: Any) -> list[trace.Tried]:
+        asked.extend((old.key, new.key) for _, _, old, new, _ in items)
+        return []
+
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    monkeypatch.setattr(contests, "_refitted", refitted)
+    skew = tried_as(fitted(1, 0.5), "channel_mismatch:skew")
+    none = Dataset((), (), 0.0)
+    for left, others in (
+        (1.2, [("acoustic_mode:mode", "acoustic_mode:side_resonator")]),
+        (0.5, []),
+    ):
+        mode = tried_as(fitted(1, left), "acoustic_mode:mode")
+        contests.in_finer_forms(
+            [skew, mode],
+            none,
+            [by_key(k) for k in ("acoustic_mode:side_resonator", "acoustic_mode:mode")],
+            InProcess(),
+        )
+        assert asked == others
+        asked.clear()
 
 
 @pytest.mark.parametrize("form", ["tanh_gain", "arctan_gain", "quadratic_odd"])
