@@ -195,22 +195,34 @@ def in_each_form(
     done: Collection[tuple[str, ...]] = (),
 ) -> list[Tried]:
     """Each effect of `t` in its other forms, but for what (by forms) is `done`."""
-    items = []
+    items = [
+        (t, kept, e, form, data)
+        for t, kept, e, form, data in _other_forms(t, data, available, done)
+        if not (form.refines and t.explains)
+        and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
+    ]
+    items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
+    return _refitted(items, data, run)
+
+
+def _other_forms(
+    t: Tried, data: Dataset, available: Sequence[Effect], done: Collection[tuple[str, ...]]
+) -> list[_Exchange]:
+    """Each effect of `t` against each other form of it that may stand there, but for what (by
+    forms) is `done`."""
+    out: list[_Exchange] = []
     for e in t.effects:
         kept = tuple(o for o in t.effects if o is not e)
-        items += [
+        out += [
             (t, kept, e, form, data)
             for form in available
             if form.name == e.name
             and form.key != e.key
             and suits(form, t.fit.structure, kept)
             and joins(form, kept)
-            and not (form.refines and t.explains)
-            and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
             and key_of_forms((*kept, form)) not in done
         ]
-    items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
-    return _refitted(items, data, run)
+    return out
 
 
 def suits(form: Effect, structure: Structure, beside: Sequence[Effect]) -> bool:
@@ -467,21 +479,12 @@ def in_finer_forms(
         return []
     best = best_form(good)
     done = {t.key_of_forms for t in tries if t.adequate}
-    items = []
+    finer = [form for form in available if form.refines]
+    items: list[_Exchange] = []
     for t in best_by_name(good):
         behind = t.key != best.key and not best.parts < t.parts
-        if not behind or t.evidence < best.evidence + EVIDENCE:
-            continue
-        for e in t.effects:
-            kept = tuple(o for o in t.effects if o is not e)
-            items += [
-                (t, kept, e, form, data)
-                for form in available
-                if form.name == e.name
-                and form.refines
-                and suits(form, t.fit.structure, kept)
-                and key_of_forms((*kept, form)) not in done
-            ]
+        if behind and t.evidence >= best.evidence + EVIDENCE:
+            items += _other_forms(t, data, finer, done)
     return _refitted(items, data, run)
 
 
