@@ -78,6 +78,15 @@ def test_free_limit_cycle_is_the_thesis_one() -> None:
     np.testing.assert_allclose(np.abs(orbits.velocity[0, :3]), FREE_HARMONICS, rtol=3e-4)
 
 
+def test_a_free_frequency_does_not_depend_on_where_its_search_starts() -> None:
+    """A clean record of half a minute knows it to 1e-10, and a descent along a long valley must see
+    what a hundredth of that brings."""
+    structure, at = Structure(), free_conditions()
+    starts = at.omega * (1 + np.array([0.0, 1e-3, 1e-4, 3e-5, 1e-5, 1e-6])[:, None])
+    found = [balance.solve(structure, theta(structure), at, start_omega=w).omega for w in starts]
+    assert np.ptp(found) < 3e-13 * found[0][0]
+
+
 @pytest.mark.parametrize("free", [False, True])
 def test_derivatives_agree_with_differences(free: bool) -> None:
     structure = Structure()
