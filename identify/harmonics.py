@@ -36,6 +36,7 @@ FloatArray = npt.NDArray[np.float64]
 SIDE_BINS = 20  # neighbours on either side that give a coefficient's noise
 VARIANCE_DOF = 4 * SIDE_BINS  # real degrees of freedom behind each estimated variance
 SEGMENTS = 256  # a record's demodulated signal is averaged to this many points
+USABLE = 0.45  # of the sample rate: nearer to half of it, a line's phase is lost in its image
 APART_BINS = 2.0  # a tone nearer to a harmonic cannot be fitted beside it
 DISTORTION = 1e-6  # of the fundamental in each harmonic: the best of recording chains, −120 dB
 BARELY_LOCKED = 0.8  # share of forced runs that may be: a peak in more is a modulation
@@ -149,7 +150,7 @@ def measure(
 ) -> Harmonics:
     """Fourier coefficients and their noise of one run.
 
-    `harmonics` is reduced to those below 0.45 of the sample rate. `tones`: foreign ones, peak
+    `harmonics` is reduced to those below `USABLE` of the sample rate. `tones`: foreign ones, peak
     amplitude of the velocity (m/s) by frequency (Hz).
     """
     values = {n: np.asarray(s.values, dtype=float) for n, s in run.signals.items()}
@@ -175,7 +176,7 @@ def measure(
     else:
         assert drive is not None
         frequency = drive_frequency(drive, rate, run.frequency_hz)
-    K = max(1, min(harmonics, int(0.45 * rate / frequency)))
+    K = max(1, min(harmonics, int(USABLE * rate / frequency)))
     k = np.arange(1, K + 1)
     omega = 2 * np.pi * frequency * k
     signals = np.stack([*inputs, drive if drive is not None else np.zeros_like(inputs[0])])
@@ -359,7 +360,7 @@ def estimate_frequency(x: FloatArray, rate: float, low_hz: float = 20.0) -> floa
     window = np.hanning(n)
     spectrum = np.abs(np.fft.rfft((x - x.mean()) * window))
     f = np.arange(spectrum.size) * rate / n
-    spectrum[f < low_hz] = 0.0
+    spectrum[(f < low_hz) | (f > USABLE * rate)] = 0.0
     peak = int(np.argmax(spectrum))
     frequency = float(f[peak])
     if 0 < peak < spectrum.size - 1:
@@ -378,7 +379,7 @@ def refine_frequency(x: FloatArray, rate: float, frequency: float, harmonics: in
     Cramér–Rao bound in white noise.
     """
     n = x.size
-    count = max(1, min(harmonics, int(0.45 * rate / frequency)))
+    count = max(1, min(harmonics, int(USABLE * rate / frequency)))
     t = np.asarray((np.arange(n) - (n - 1) / 2) / rate, dtype=np.float64)
     for _ in range(8):
         basis = harmonic_basis(t, frequency, count)

@@ -490,6 +490,15 @@ def test_the_highest_bin_of_noise_is_no_limit_cycle(clean: Campaign) -> None:
     assert "22.0 Hz, has 52 %" in found.flags[0].detail
 
 
+def test_what_toggles_from_sample_to_sample_is_no_limit_cycle(clean: Campaign) -> None:
+    """At half the sample rate the phase of a line is lost, and so is its size."""
+    rng = np.random.default_rng(3)
+    toggling = pressures(
+        lambda x, t: 0.3 * rng.standard_normal(t.size) + 0.03 * (-1.0) ** np.arange(t.size)
+    )
+    assert judged(clean, toggling, 0)[1] == {"no_limit_cycle": "excluded"}
+
+
 def test_noise_at_low_frequency(clean: Campaign) -> None:
     rng = np.random.default_rng(6)
     wind = 2.0 * np.cumsum(rng.standard_normal(20000))

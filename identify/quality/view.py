@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.harmonics import (
+    USABLE,
     Microphones,
     drive_frequency,
     estimate_frequency,
@@ -126,7 +127,7 @@ def view(run: Run, medium: Medium) -> View:
         frequency = estimate_frequency(np.mean(signals, axis=0), rate)
     else:
         frequency = drive_frequency(drive, rate, run.frequency_hz)
-    count = max(1, min(HARMONICS, int(0.45 * rate / frequency)))
+    count = max(1, min(HARMONICS, int(USABLE * rate / frequency)))
     stacked = np.stack([*signals, drive if drive is not None else np.zeros_like(signals[0])])
     c, rest = fit_harmonics(stacked, rate, frequency, count)
     return View(run, medium, inputs, mics, values, frequency, c, rest)

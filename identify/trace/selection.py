@@ -36,7 +36,7 @@ from identify.trace.contests import (
 )
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
-from identify.trace.scores import ScoreTest, score_tests, stepped
+from identify.trace.scores import ScoreTest, family_p, score_tests, stepped
 from identify.trace.stages import (
     as_declared,
     started_again,
@@ -76,6 +76,7 @@ STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 STEPS_ON = 24  # of a spread that is led to the end, each so many times the last one …
 FURTHER, LIKELIER = 2.0, 0.1  # … further, while that takes so much off χ² and penalty
+DOUBT, MISSING = 0.05, 1e-6  # a claim that leaves less probably noise, of which scores say so
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
 
@@ -155,6 +156,8 @@ def search(
     if going.seeking:
         going.each_alone(scores)
     going.contest()
+    if going.one_more(depth):
+        going.contest()
     everything = against_chance(going.tried)
     ranked = tuple(sorted(everything, key=lambda t: (not t.adequate, t.fit.chi2)))
     return Search(ranked, tuple(singles), tuple(pieces), whole=not going.left_out)
@@ -312,6 +315,22 @@ class _Searching:
             shorten = t.adequate or any(t is b for b in best)
             self.tried.append(eliminate(t, self.data) if shorten else t)
         return [*grown, *afar]
+
+    def one_more(self, depth: int) -> bool:
+        """Whether a claim that hardly leaves noise has lacked one effect more, as its score tests
+        say beyond doubt: the lesser of two may stay under the threshold of what must be explained.
+        """
+        good = [t for t in against_chance(self.tried) if t.explains]
+        best = best_form(good) if good else None
+        if best is None or best.spread is not None or best.all_p > DOUBT or self.late:
+            return False
+        if len(best.effects) >= depth or best.key_of_forms in self.extended:
+            return False
+        beside = [e for e in self.apart if joins(e, best.effects)]
+        scores = score_tests(best.fit.structure, self.data, best.fit, beside, self.run)
+        if family_p(list(scores.values())) > MISSING:
+            return False
+        return any(t.explains and best.parts < t.parts for t in self.grown([best]))
 
     def of_more_modes(self, level: Sequence[Tried]) -> list[Tried]:
         """Several modes more, from the data alone, where they leave less than all of `level`: more
