@@ -850,6 +850,26 @@ def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> No
     assert abs(change.value - 0.0015 * over) < 4 * change.stderr
 
 
+def test_a_lesser_effect_beside_one_that_leaves_hardly_more_than_noise(tmp_path: Path) -> None:
+    """The drift alone would pass; the score test of the distortion says that it is not all."""
+    both = [
+        ("parameter_drift", {"speaker_gain_change": 0.02}),
+        ("actuator_nonlinearity/distortion", {"quadratic_per_v": -0.0014}),
+    ]
+    ready = thesis_campaign(tmp_path, 11, both, noise_db=50.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    keys = ("parameter_drift:speaker_gain", "flame_delay", "actuator_nonlinearity:quadratic")
+    catalogue = [by_key(k) for k in keys]
+    alone = trace.search(ready.structure, ready.data, base, catalogue=catalogue[:2]).tried
+    drift = trace.best_form([t for t in alone if t.explains])
+    assert drift.names == ("parameter_drift",)
+    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
+    best = trace.best_form([t for t in found if t.explains])
+    assert best.key == ("actuator_nonlinearity", "parameter_drift")
+    a2 = best.estimates["actuator_nonlinearity.a2"]
+    assert abs(a2.value + 0.0014) < 4 * a2.stderr
+
+
 @pytest.mark.slow
 def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
     """Each leads the other astray, but where more noise hides the scatter the distortion is seen:

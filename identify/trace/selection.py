@@ -76,7 +76,7 @@ STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 STEPS_ON = 24  # of a spread that is led to the end, each so many times the last one …
 FURTHER, LIKELIER = 2.0, 0.1  # … further, while that takes so much off χ² and penalty
-DOUBT, MISSING = 0.05, 1e-6  # a claim that leaves less probably noise, of which scores say so
+MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
 
@@ -317,12 +317,11 @@ class _Searching:
         return [*grown, *afar]
 
     def one_more(self, depth: int) -> bool:
-        """Whether a claim that hardly leaves noise has lacked one effect more, as its score tests
-        say beyond doubt: the lesser of two may stay under the threshold of what must be explained.
-        """
+        """Whether a claim has lacked one effect more, as the score tests beside it say beyond
+        doubt: the lesser of two may stay under the threshold of what must be explained."""
         good = [t for t in against_chance(self.tried) if t.explains]
         best = best_form(good) if good else None
-        if best is None or best.spread is not None or best.all_p > DOUBT or self.late:
+        if best is None or best.spread is not None or self.late:
             return False
         if len(best.effects) >= depth or best.key_of_forms in self.extended:
             return False
