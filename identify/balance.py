@@ -41,7 +41,7 @@ FloatArray = npt.NDArray[np.float64]
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
-TOLERANCE = 1e-12  # relative Newton residual: above rounding, and below what any step brings
+TOLERANCE = 1e-10  # relative Newton residual: far below any noise, above rounding
 MAX_ITERATIONS = 12  # Newton steps; twice as many where ω is an unknown too
 NEAR = 1e-7  # of ω: within that, the terms' first order in ω is exact to far below any noise
 APART = 1e-8  # of ω: over that far slopes by ω are taken, to 1e-6 of themselves at the sharpest

@@ -51,6 +51,7 @@ WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_w
 LONG = 600  # iterations that lead on what comes nearest and has not converged
 DAMPED = (3e-4, 0.5)  # damping ratios between which a mode is one
 REFUSED = 1e-3  # chance of held-out runs below which another minimum is sought that suits them too
+SAME_DEPTH = 1e-3  # share of χ² by which two minima differ
 FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
 
@@ -659,7 +660,17 @@ def _noise(dof: int) -> float:
 
 
 def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) -> list[Fit]:
-    """The fit from starts with the other modes placed more densely; none where none exists.
+    """The fit from starts with the other modes placed more densely; none where none exists."""
+    chosen = _denser(structure, rough, near, data.free_hz)
+    if not chosen:
+        return []
+    worse, steps = no_better(near, data), (0.003, 0.0)
+    thetas = np.stack(chosen)
+    return [fit_orbits(structure, data, thetas, continuation=steps, iterations=120, hopeless=worse)]
+
+
+def _denser(structure: Structure, rough: Dataset, near: Fit, free_hz: float) -> list[FloatArray]:
+    """Starts with the other modes placed more densely than at first, best first.
 
     Modes that do not sing are seen at a few harmonics only: between those, a fit with one of them
     at the wrong place is a local minimum in its own right, from which no descent comes back. What
@@ -668,11 +679,24 @@ def _replaced(structure: Structure, data: Dataset, rough: Dataset, near: Fit) ->
     dense = dense_placements(structure.mode_count - 1)
     thetas = _signed(structure, _slow_flow_thetas(structure, rough, (), dense))
     for placement in dense:
-        thetas += _moved(structure, near, data.free_hz, placement)
+        thetas += _moved(structure, near, free_hz, placement)
     starts = _best_of_each(structure, coarse(structure, rough, thetas))
     polished = polish(structure, rough, starts[:DENSE])
-    if not polished:
+    return [s.theta for s in distinct(structure, polished)[:8]]
+
+
+def other_minima(structure: Structure, data: Dataset, near: Fit, times: float) -> list[Fit]:
+    """Fits of the declared model that converge elsewhere and leave no more than so many times what
+    `near` leaves, best first: where the model lacks something, the least misfit may be of a mode
+    that has gone to the wrong place to make up for it."""
+    if structure.mode_count < 2:
         return []
-    chosen = np.stack([s.theta for s in distinct(structure, polished)[:8]])
-    worse, steps = no_better(near, data), (0.003, 0.0)
-    return [fit_orbits(structure, data, chosen, continuation=steps, iterations=120, hopeless=worse)]
+    out = [near]
+    starts = _denser(structure, data.coarse(), near, data.free_hz)
+    fits = [fit_orbits(structure, data, t, continuation=(0.003, 0.0)) for t in starts]
+    for fit in sorted(fits, key=lambda f: f.chi2):
+        # of the same depth are those in which two modes have changed names
+        new = not any(abs(fit.chi2 - o.chi2) < SAME_DEPTH * o.chi2 for o in out)
+        if fit.converged and new and fit.chi2 < times * near.chi2:
+            out.append(fit)
+    return out[1:]

@@ -412,6 +412,23 @@ def test_what_wanders_is_sought_from_afar_where_a_fit_without_it_is_astray(tmp_p
     assert far[0].fit_p > 0.1  # the held-out runs are no softer
 
 
+def test_effects_are_sought_from_other_minima_of_the_declared_model_too(tmp_path: Path) -> None:
+    """A gain of 1.3e-3 is made up for best by a mode that has gone to another's place, from where
+    the gain leads nowhere; the next best minimum is the one that it was needed in (40024)."""
+    rig = random_rig(40024, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    made = [make_effect("channel_mismatch/gain", {"gain": 0.0013235641})]
+    ready = record(tmp_path, 40024, rig, made, forced=7, validation=2, cold=1, modes=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    (other,) = start.other_minima(ready.structure, ready.data, base, 1.5)
+    assert base.converged
+    assert other.chi2 > base.chi2 > 15 * base.dof
+    catalogue = [by_key("channel_mismatch:gain")]
+    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue, depth=1).tried
+    best = trace.best_form([t for t in found if t.explains])
+    value = best.estimates["channel_mismatch.gain"]
+    assert abs(value.value - 0.0013235641) < 4 * value.stderr
+
+
 def test_what_is_far_less_likely_in_a_coarse_form_is_contested_in_a_finer_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -63,12 +63,14 @@ def record(
     *,
     forced: int,
     validation: int,
+    cold: int = 0,
     modes: int = 2,
     change: Callable[[RecordedRun], RecordedRun] = lambda run: run,
 ) -> Prepared:
     """A random campaign on a rig with these effects, so many modes declared, each recording
     changed, written and read."""
-    rig, plan = random_campaign(seed, rig, effects, forced=forced, validation=validation)
+    runs = {"forced": forced, "validation": validation, "cold": cold}
+    rig, plan = random_campaign(seed, rig, effects, **runs)
     made = simulate_campaign(rig, plan, seed, declared_modes=modes)
     write_campaign(replace(made, runs=tuple(map(change, made.runs))), folder)
     return prepare(load_campaign(open_campaign(folder)))

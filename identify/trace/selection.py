@@ -14,7 +14,7 @@ from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits, soften
-from identify.start import fit_from_data
+from identify.start import fit_from_data, other_minima
 from identify.structure import Effect, Structure
 from identify.trace.contests import (
     BEHIND,
@@ -76,6 +76,8 @@ STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 STEPS_ON = 24  # of a spread that is led to the end, each so many times the last one …
 FURTHER, LIKELIER = 2.0, 0.1  # … further, while that takes so much off χ² and penalty
+MINIMA = 2  # of the declared model, beside the deepest, from which effects are sought …
+PROMISING = 2.0  # … that promise to leave no more there than so many times what the best leaves
 MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
@@ -219,6 +221,13 @@ class _Searching:
     def declared(self) -> Tried:
         return tried((), self.base, self.data)
 
+    @cached_property
+    def minima(self) -> tuple[Fit, ...]:
+        """Other minima of the declared model, where it is near enough to the data to have some."""
+        if astray(self.base):
+            return ()
+        return tuple(other_minima(self.structure, self.data, self.base, BEHIND)[:MINIMA])
+
     @property
     def by_chance(self) -> bool:
         """Whether a spread explains the data by itself: what else is in them is within it."""
@@ -235,9 +244,8 @@ class _Searching:
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
         base = self.base
-        singles = _alone(
-            _Alone(self.structure, self.data, base, self.available, scores), self.run, self.report
-        )
+        work = _Alone(self.structure, self.data, base, self.available, scores, self.minima)
+        singles = _alone(work, self.run, self.report)
         self.tried += singles
         self.found |= {t.key_of_forms for t in singles if t.explains}
         if base.chi2_per_dof < LITTLE or not self.explained:
@@ -264,6 +272,7 @@ class _Searching:
                 self.base,
                 tuple(e for e in self.available if e.name == name),
                 scores,
+                self.minima,
             )
             for name in names
         ]
@@ -321,13 +330,13 @@ class _Searching:
         doubt: the lesser of two may stay under the threshold of what must be explained."""
         good = [t for t in against_chance(self.tried) if t.explains]
         best = best_form(good) if good else None
-        if best is None or best.spread is not None or self.late:
+        if best is None or best.spread is not None:
             return False
         if len(best.effects) >= depth or best.key_of_forms in self.extended:
             return False
         beside = [e for e in self.apart if joins(e, best.effects)]
         scores = score_tests(best.fit.structure, self.data, best.fit, beside, self.run)
-        if family_p(list(scores.values())) > MISSING:
+        if family_p(list(scores.values())) > MISSING or self.late:
             return False
         return any(t.explains and best.parts < t.parts for t in self.grown([best]))
 
@@ -487,16 +496,19 @@ class _Alone:
     base: Fit
     available: tuple[Effect, ...]
     scores: Mapping[str, ScoreTest] | None
+    minima: tuple[Fit, ...]  # others of the declared model
 
 
 def _alone(work: _Alone, run: Executor, report: Progress) -> list[Tried]:
     """Every effect by itself; the best of them in their other forms too."""
     data, base, available = work.data, work.base, work.available
     far = astray(base)
+    apart = [e for e in available if not e.refines]
     singles = try_effects(
-        work.structure, data, base, [e for e in available if not e.refines], executor=run, keep=8,
+        work.structure, data, base, apart, executor=run, keep=8,
         far=far, progress=lambda share, text: report(0.6 * share, text), scores=work.scores,
     )  # fmt: skip
+    singles += _from_other_minima(work, apart, singles, run, report)
     if far and not any(t.adequate for t in singles):
         report(0.6, "starting the best once more from afar")
         singles = started_again(singles, data, run)
@@ -512,6 +524,27 @@ def _alone(work: _Alone, run: Executor, report: Progress) -> list[Tried]:
     singles += at_the_same_place(singles, data, available, run)
     singles += led_on(singles, data, run)
     return singles
+
+
+def _from_other_minima(
+    work: _Alone,
+    effects: Sequence[Effect],
+    singles: Sequence[Tried],
+    run: Executor,
+    report: Progress,
+) -> list[Tried]:
+    """Effects from other minima of the declared model, where one promises to leave no more there
+    than the best of `singles` does (40024: a gain that the fit of a mode gone astray hides)."""
+    out: list[Tried] = []
+    for base in work.minima:
+        scores = score_tests(work.structure, work.data, base, effects, run)
+        promised = base.chi2 - max((s.drop for s in scores.values()), default=0.0)
+        if promised < PROMISING * min((misfit(t) for t in (*singles, *out)), default=np.inf):
+            out += try_effects(
+                work.structure, work.data, base, effects, executor=run, keep=8, far=False,
+                progress=lambda share, text: report(0.6, text), scores=scores,
+            )  # fmt: skip
+    return out
 
 
 def _by_itself(work: _Alone) -> list[Tried]:
