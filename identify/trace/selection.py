@@ -36,9 +36,10 @@ from identify.trace.contests import (
 )
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
-from identify.trace.scores import ScoreTest, family_p, score_tests, stepped
+from identify.trace.scores import ScoreTest, family_p, scan, score_tests, stepped
 from identify.trace.stages import (
     as_declared,
+    known_sizes,
     started_again,
     try_effects,
     try_scatters,
@@ -78,7 +79,8 @@ STEPS_ON = 24  # of a spread that is led to the end, each so many times the last
 FURTHER, LIKELIER = 2.0, 0.1  # … further, while that takes so much off χ² and penalty
 MINIMA = 2  # of the declared model, beside the deepest, from which effects are sought …
 PROMISING = 2.0  # … that promise to leave no more there than so many times what the best leaves
-MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect
+MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect …
+DOUBT = 0.05  # … and of what a law leaves, below which it is asked what chance beside it does
 LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
 
 
@@ -326,19 +328,25 @@ class _Searching:
         return [*grown, *afar]
 
     def one_more(self, depth: int) -> bool:
-        """Whether a claim has lacked one effect more, as the score tests beside it say beyond
-        doubt: the lesser of two may stay under the threshold of what must be explained."""
+        """Whether a claim has lacked one effect more: a law, as the score tests beside it say
+        beyond doubt, or chance, beside what hardly leaves noise. The lesser of two may stay under
+        the threshold of what must be explained."""
         good = [t for t in against_chance(self.tried) if t.explains]
         best = best_form(good) if good else None
-        if best is None or best.spread is not None:
+        if best is None or best.spread is not None or len(best.effects) >= depth:
             return False
-        if len(best.effects) >= depth or best.key_of_forms in self.extended:
-            return False
-        beside = [e for e in self.apart if joins(e, best.effects)]
-        scores = score_tests(best.fit.structure, self.data, best.fit, beside, self.run)
-        if family_p(list(scores.values())) > MISSING or self.late:
-            return False
-        return any(t.explains and best.parts < t.parts for t in self.grown([best]))
+        found: list[Tried] = []
+        if best.fit_p < DOUBT and not self.late:
+            beside = self._scattered(best.fit.structure, best.fit)
+            beside += _simpler_beside_chance(beside, self.data, self.apart, self.run)
+            self._add_beside_chance(beside)
+            found += beside
+        if best.key_of_forms not in self.extended:
+            more = [e for e in self.apart if joins(e, best.effects)]
+            scores = score_tests(best.fit.structure, self.data, best.fit, more, self.run)
+            if family_p(list(scores.values())) < MISSING and not self.late:
+                found += self.grown([best])
+        return any(t.explains and best.parts < t.parts for t in found)
 
     def of_more_modes(self, level: Sequence[Tried]) -> list[Tried]:
         """Several modes more, from the data alone, where they leave less than all of `level`: more
@@ -700,20 +708,33 @@ def _beside_chance(
         assert isinstance(chance, Scatter)
         assert t.spread is not None
         base, wide = t.fit, t.spread.data
-        scores = score_tests(base.structure, wide, base, available, run)
-        ranked = sorted(
-            (e for e in available if e.key in scores), key=lambda e: -scores[e.key].drop
-        )
-        best = first_of_each(ranked, lambda e: e.name)  # the best form of each
-        for e in list(best.values())[:BESIDE]:
-            neutral = e.neutral()
-            assert neutral is not None  # or it would have no score
-            thetas = stepped(base.structure, wide, base, e, [e.to_internal(neutral)])
+        for e, none in _promising_most(base, wide, available, run):
+            thetas = stepped(base.structure, wide, base, e, [none])
             if thetas:
                 larger = base.structure.with_effects(e)
                 fit = fit_orbits(larger, wide, thetas[0], continuation=(0.0,))
                 out += try_scatters(larger, data, fit, [chance], run)
     return out
+
+
+def _promising_most(
+    base: Fit, data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[tuple[Effect, FloatArray]]:
+    """The effects whose tangents take most off the misfit of `base`, each in its best form, and of
+    those whose shape is unknown the best one; with internal values at which they vanish."""
+    scores = score_tests(base.structure, data, base, available, run)
+    ranked = sorted((e for e in available if e.key in scores), key=lambda e: -scores[e.key].drop)
+    best = list(first_of_each(ranked, lambda e: e.name).values())[:BESIDE]
+    out = [(e, e.to_internal(none)) for e in best if (none := e.neutral()) is not None]
+    known = known_sizes(data, base)
+    scanned = [
+        (drop, e, none)
+        for e in available
+        if e.key not in scores and (shapes := e.shapes(known))
+        for drop, none, _ in scan(base.structure, data, base, e, shapes)[:1]
+    ]
+    shaped = max(scanned, key=lambda found: found[0], default=None)
+    return out if shaped is None else [*out, shaped[1:]]
 
 
 def _in_the_place_of_chance(
