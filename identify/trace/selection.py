@@ -71,7 +71,7 @@ CHANCE_SOFTENED, LAW_SOFTENED = (0.001, 0.005, 0.02), (0.005, 0.02)
 FOREMOST, FORMS = 2, 4  # laws seen there beside which chance is tried, and forms of each …
 ALIKE = 1.05  # … that leave no more than so many times the least
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
-MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought, and chance, from afar
+MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought from afar
 NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
@@ -81,7 +81,7 @@ MINIMA = 2  # of the declared model, beside the deepest, from which effects are 
 PROMISING = 2.0  # … that promise to leave no more there than so many times what the best leaves
 MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect …
 DOUBT = 0.05  # … and of what a law leaves, below which it is asked what chance beside it does
-LITTLE = 5.0  # χ²/dof of the declared fit up to which a law of some parameters may follow chance
+LITTLE = 5.0  # χ²/dof up to which a law of some parameters may follow chance, and hide it
 
 
 class Cancelled(Exception):
@@ -398,7 +398,7 @@ class _Searching:
         ):
             for share in shares:
                 # a spread always comes near
-                if self.seeking and _least(self.laws) > MUCH:
+                if self.seeking and _least(self.laws) > LITTLE:
                     self.report(0.6, f"looking at the data to within {share:.1%}")
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
