@@ -361,7 +361,7 @@ def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     going.with_chance([])
     assert [t for t in asked if t.startswith("looking at the data to within")]
     asked.clear()
-    going.tried.append(replace(law, fit=fitted(1, 20.0)))
+    going.tried.append(replace(law, fit=fitted(1, 4.0)))
     going.with_chance([])
     assert not [t for t in asked if t.startswith("looking at the data to within")]
 
