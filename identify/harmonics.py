@@ -176,7 +176,7 @@ def measure(
     else:
         assert drive is not None
         frequency = drive_frequency(drive, rate, run.frequency_hz)
-    K = max(1, min(harmonics, int(USABLE * rate / frequency)))
+    K = usable_harmonics(harmonics, frequency, rate)
     k = np.arange(1, K + 1)
     omega = 2 * np.pi * frequency * k
     signals = np.stack([*inputs, drive if drive is not None else np.zeros_like(inputs[0])])
@@ -379,7 +379,7 @@ def refine_frequency(x: FloatArray, rate: float, frequency: float, harmonics: in
     Cramér–Rao bound in white noise.
     """
     n = x.size
-    count = max(1, min(harmonics, int(USABLE * rate / frequency)))
+    count = usable_harmonics(harmonics, frequency, rate)
     t = np.asarray((np.arange(n) - (n - 1) / 2) / rate, dtype=np.float64)
     for _ in range(8):
         basis = harmonic_basis(t, frequency, count)
@@ -398,6 +398,12 @@ def refine_frequency(x: FloatArray, rate: float, frequency: float, harmonics: in
         if abs(step) < 1e-9 * frequency:
             break
     return frequency
+
+
+def usable_harmonics(most: int, frequency: float, rate: float) -> int:
+    """How many harmonics of a frequency, of `most`, lie below `USABLE` of the sample rate; the
+    first in any case."""
+    return max(1, min(most, int(USABLE * rate / frequency)))
 
 
 def harmonic_basis(t: FloatArray, frequency: float, count: int) -> FloatArray:

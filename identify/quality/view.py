@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.harmonics import (
-    USABLE,
     Microphones,
     drive_frequency,
     estimate_frequency,
     fit_harmonics,
     microphones,
+    usable_harmonics,
 )
 from identify.record import Medium, Run
 
@@ -127,7 +127,7 @@ def view(run: Run, medium: Medium) -> View:
         frequency = estimate_frequency(np.mean(signals, axis=0), rate)
     else:
         frequency = drive_frequency(drive, rate, run.frequency_hz)
-    count = max(1, min(HARMONICS, int(USABLE * rate / frequency)))
+    count = usable_harmonics(HARMONICS, frequency, rate)
     stacked = np.stack([*signals, drive if drive is not None else np.zeros_like(signals[0])])
     c, rest = fit_harmonics(stacked, rate, frequency, count)
     return View(run, medium, inputs, mics, values, frequency, c, rest)

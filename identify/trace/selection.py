@@ -733,8 +733,8 @@ def _promising_most(
         if e.key not in scores and (shapes := e.shapes(known))
         for drop, none, _ in scan(base.structure, data, base, e, shapes)[:1]
     ]
-    shaped = max(scanned, key=lambda found: found[0], default=None)
-    return out if shaped is None else [*out, shaped[1:]]
+    scanned.sort(key=lambda item: -item[0])
+    return [*out, *((e, none) for _, e, none in scanned[:1])]
 
 
 def _in_the_place_of_chance(
