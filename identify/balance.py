@@ -16,7 +16,6 @@ Newton's own steps take the slopes by a free run's ω from a difference.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -25,10 +24,12 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.newton import add_held, newton, slopes
+from identify.periods import period_matrices, period_waves, to_harmonics, to_time
 from identify.polynomial import Polynomial
 from identify.structure import (
     Characteristic,
     Conditions,
+    Effect,
     Loop,
     Preceded,
     Structure,
@@ -46,46 +47,6 @@ MAX_ITERATIONS = 12  # Newton steps; twice as many where ω is an unknown too
 NEAR = 1e-7  # of ω: within that, the terms' first order in ω is exact to far below any noise
 APART = 1e-8  # of ω: over that far slopes by ω are taken, to 1e-6 of themselves at the sharpest
 FINE = 1024  # samples a period of a `Preceded` characteristic: turning points to 5e-6 of the swing
-
-
-@lru_cache(maxsize=32)
-def _period(harmonics: int, samples: int | None = None) -> tuple[FloatArray, ComplexArray]:
-    """Matrices to and from time samples over one period: (T, 2K) and (K, T)."""
-    samples = samples or max(64, 8 * harmonics)
-    tau = 2 * np.pi * np.arange(samples) / samples
-    angle = np.outer(tau, np.arange(1, harmonics + 1))
-    to_time = np.hstack([np.cos(angle), -np.sin(angle)])
-    to_harmonics = (2.0 / samples) * np.exp(-1j * angle.T)
-    return to_time, to_harmonics
-
-
-@lru_cache(maxsize=32)
-def _waves(harmonics: int, samples: int | None = None) -> tuple[FloatArray, FloatArray]:
-    """cos mτ and sin mτ, m = 0 … 2K, at the same time samples: (T, 2K + 1) each."""
-    samples = _period(harmonics, samples)[0].shape[0]
-    angle = 2 * np.pi * np.outer(np.arange(samples), np.arange(2 * harmonics + 1)) / samples
-    return np.cos(angle), np.sin(angle)
-
-
-def to_time(c: Any, harmonics: int, samples: int | None = None) -> Any:
-    """Time samples (runs, T) over one period of Σ Re c_k e^{jkτ}; `c` an array or a Dual."""
-    matrix = _period(harmonics, samples)[0]
-    if isinstance(c, Dual):
-        stacked = np.concatenate([c.v.real, c.v.imag], axis=1) @ matrix.T
-        d = np.broadcast_to(c.d, (*c.v.shape, c.d.shape[-1]))
-        both = np.concatenate([d.real, d.imag], axis=1)
-        return Dual(stacked, np.einsum("tk,rkp->rtp", matrix, both, optimize=True))
-    return np.concatenate([c.real, c.imag], axis=1) @ matrix.T
-
-
-def to_harmonics(x: Any, harmonics: int, samples: int | None = None) -> Any:
-    """Fourier coefficients (runs, K) of time samples over one period; the mean is dropped."""
-    matrix = _period(harmonics, samples)[1]
-    if isinstance(x, Dual):
-        d = np.broadcast_to(x.d, (*x.v.shape, x.d.shape[-1]))
-        both = np.concatenate([matrix.real, matrix.imag]) @ d
-        return Dual(x.v @ matrix.T, both[:, :harmonics] + 1j * both[:, harmonics:])
-    return x @ matrix.T
 
 
 @dataclass(frozen=True)
@@ -276,7 +237,10 @@ def _solved(
     """Inputs, frequencies, relative residuals, steps taken and N̂ with the terms as they are."""
     if not all(isinstance(n, Polynomial) for n in near.N):
         return _sampled_newton(near, v, omega, free, left)
-    curves, waves = _tables(near.N, omega.size), _waves(v.shape[2], _samples(near.N, v.shape[2]))
+    curves, waves = (
+        _tables(near.N, omega.size),
+        period_waves(v.shape[2], _samples(near.N, v.shape[2])),
+    )
     terms = near.P, near.Q, near.dP, near.dQ
     found = newton(*terms, curves, v, omega, *waves, free, left, TOLERANCE)
     return v, omega, *found
@@ -393,7 +357,7 @@ def _slopes(N: Sequence[Characteristic], v: ComplexArray) -> Sequence[ComplexArr
     """∂N̂/∂x of every nonlinearity, (runs, K, 2K) each."""
     K = v.shape[2]
     if all(isinstance(n, Polynomial) for n in N):
-        waves = _waves(K, _samples(N, K))
+        waves = period_waves(K, _samples(N, K))
         return tuple(slopes(_tables(N, v.shape[1]), np.ascontiguousarray(v), *waves))
     return [_force_jacobian(n, x, K) for n, x in zip(N, v, strict=True)]
 
@@ -409,7 +373,7 @@ def _force_jacobian(n: Characteristic, v: ComplexArray, K: int) -> ComplexArray:
     out = _from_slope(slope * moving, K, FINE)
     for share, at in passed.follows:
         if not np.all(at == own):
-            add_held(slope * share, at, *_period(K, FINE), out)
+            add_held(slope * share, at, *period_matrices(K, FINE), out)
     return out
 
 
@@ -424,7 +388,7 @@ def _from_slope(slope: FloatArray, K: int, samples: int | None = None) -> Comple
 
 def _orders(slope: FloatArray, K: int, samples: int | None) -> ComplexArray:
     """⟨N′ e^{−jmτ}⟩ of the orders m = 1 − K … 2K, (runs, 3K)."""
-    cosines, sines = _waves(K, samples)
+    cosines, sines = period_waves(K, samples)
     re, im = slope @ cosines / len(cosines), slope @ sines / -len(sines)
     below = slice(K - 1, 0, -1)  # of a real slope: the conjugates
     return np.concatenate([re[:, below] - 1j * im[:, below], re + 1j * im], axis=1)
@@ -512,8 +476,12 @@ def drive_sensitivity(
     K = at.harmonics
     s = 1j * orbits.omega[:, None] * np.arange(1, K + 1)
     values = structure.parameters.plain(theta)
-    # the equations are linear in the drive: with a drive of one they give its transfer functions
-    unit = structure.assemble(values, replace(at, drive=np.ones_like(at.drive)), s)
+    # linear in the drive but for an amplifier, whose slope is near one: with a drive of one, and
+    # without the amplifier, the equations give its transfer functions
+    unbent = tuple(e for e in structure.effects if type(e).amplifier is Effect.amplifier)
+    unit = replace(structure, effects=unbent).assemble(
+        values, replace(at, drive=np.ones_like(at.drive)), s
+    )
     loop = structure.assemble(values, at, s)
     by_input = _slopes(loop.N, orbits.inputs)
     entering = np.concatenate([_diagonal(q, at.runs, K) for q in unit.Q], axis=1)

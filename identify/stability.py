@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from identify import balance
+from identify import balance, periods
 from identify.balance import Orbits
 from identify.structure import Conditions, Structure, Values
 
@@ -58,7 +58,7 @@ class Disturbed:
         order = np.arange(-kept, kept + 1)
         blocks = []
         for n, x in zip(loop.N, v, strict=True):
-            slope = balance.slope_along(n, balance.to_time(x, K))
+            slope = balance.slope_along(n, periods.to_time(x, K))
             c = np.fft.fft(slope, axis=1) / slope.shape[1]
             blocks.append(c[:, order[:, None] - order])
         still = replace(at, drive=np.zeros((at.runs, 1), dtype=complex),

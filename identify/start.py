@@ -23,7 +23,7 @@ from itertools import product
 import numpy as np
 import numpy.typing as npt
 
-from identify import assess, balance
+from identify import assess, periods
 from identify.dataset import Batch, Dataset
 from identify.fit import (
     Fit,
@@ -36,7 +36,7 @@ from identify.fit import (
     no_better,
     soften,
 )
-from identify.structure import Effect, Mode, Structure, Values, at_the_flame
+from identify.structure import Effect, Mode, Structure, Values, at_the_flame, driven
 from identify.thesis.rows import regressors
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -97,8 +97,8 @@ def _rows(
         P = P * (x + pole)
     Y = batch.at.velocity
     kappa = float(np.prod(poles[1:])) if m else 1.0
-    w_time = balance.to_time(kappa * Y / P, K)
-    basis = [balance.to_harmonics(w_time**d, K) for d in range(2, _degree(structure) + 1)]
+    w_time = periods.to_time(kappa * Y / P, K)
+    basis = [periods.to_harmonics(w_time**d, K) for d in range(2, _degree(structure) + 1)]
     columns, known = regressors(
         np.asarray(x, dtype=np.complex128), Y, batch.at.drive, basis, 2 * n + m, 2 * n - 1, P
     )
@@ -287,9 +287,9 @@ def corrected(data: Dataset, effects: Sequence[Effect], p: Values) -> Dataset | 
 
     def clean(b: Batch) -> Batch:
         s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
-        drive, y = b.at.drive, at_the_flame(effects, p, b.at, s)
+        drive, y = driven(effects, p, b.at, b.at.drive), at_the_flame(effects, p, b.at, s)
         for e in effects:
-            drive = e.actuator(p, b.at, s) * e.drive(p, b.at, drive)
+            drive = e.actuator(p, b.at, s) * drive
         at = replace(b.at, drive=np.broadcast_to(drive, y.shape), velocity=y)
         return replace(b, at=at, measured=y[:, : b.compared])
 
@@ -327,10 +327,10 @@ def slow_flow(data: Dataset, effects: Sequence[Effect] = (), p: Values | None = 
     phase = 1.0 + 0j
     for b in data.fit:
         s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
-        drive, y = b.at.drive, at_the_flame(effects, p, b.at, s)
+        drive, y = driven(effects, p, b.at, b.at.drive), at_the_flame(effects, p, b.at, s)
         modes = [Mode(1.0, 1.0, 1.0, 1.0)]
         for e in effects:
-            drive = e.actuator(p, b.at, s) * e.drive(p, b.at, drive)
+            drive = e.actuator(p, b.at, s) * drive
             modes = e.modes(p, b.at, modes)
         shift = np.broadcast_to(np.asarray(modes[0].frequency_hz, dtype=float), (b.runs, 1))[:, 0]
         Y, U = y[:, 0], np.broadcast_to(drive, y.shape)[:, 0]

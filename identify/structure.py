@@ -17,7 +17,7 @@ their derivatives.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ import numpy.typing as npt
 from identify import dual
 from identify.dual import Dual
 from identify.parameters import Parameter, ParameterSet
+from identify.periods import to_harmonics, to_time
 from identify.polynomial import Polynomial
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -38,6 +39,7 @@ NONLINEARITIES = ("polynomial", "saturation", "lagrange", "linear")
 
 BY_RUN = ("omega", "time", "flame_on", "identity", "free", "spacing_m")
 BY_HARMONIC = ("drive", "pressure", "velocity")
+FINE = 2048  # samples a period behind an amplifier: corners alias below 1e-6
 MODAL = ("frequency_hz", "damping", "flame_residue", "speaker_residue")  # of each declared mode
 
 
@@ -152,6 +154,16 @@ class Passed:
     by: Sequence[tuple[FloatArray, Any]]
 
 
+@dataclass(frozen=True)
+class Bent:
+    """What a static curve makes of a wave, sample by sample: its output and its slope there, (runs,
+    samples), and its partial derivatives by parameters, worked out where they are asked for."""
+
+    output: FloatArray
+    slope: FloatArray
+    by: tuple[tuple[Callable[[], FloatArray], Any], ...]
+
+
 Operator = Callable[[FloatArray], Passed]  # of time samples, (runs, samples)
 
 
@@ -212,6 +224,7 @@ class Effect:
     located: tuple[str, ...] = ()  # parameters known to within their size, or it is not seen at all
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
+    rails: bool = False  # an `amplifier` that ends at its supply: what bends besides comes before
 
     def extends(self, structure: "Structure") -> bool:
         """Whether it says what this declared model does not say already."""
@@ -287,7 +300,12 @@ class Effect:
         """A factor on the recorded drive's harmonics, ahead of the amplifier."""
         return 1.0
 
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        """What the drive becomes sample by sample, from its samples over one period."""
+        return Bent(v, np.ones_like(v), ())
+
     def drive(self, p: Values, at: Conditions, u: Any) -> Any:
+        """The drive's harmonics behind the amplifier."""
         return u
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
@@ -423,9 +441,7 @@ class Structure:
             given = d.effect.generator(d.values, at) * given
         for e in self.effects:
             given = e.generator(p, at) * given
-        drive = given * at.drive
-        for e in self.effects:
-            drive = e.drive(p, at, drive)
+        drive = driven(self.effects, p, at, given * at.drive)
         for e in self.effects:
             drive = e.actuator(p, at, s) * drive
         on = at.flame_on[:, None]
@@ -575,6 +591,43 @@ def at_the_flame(effects: Sequence[Effect], p: Values, at: Conditions, s: Any) -
             none = e.sensor(p, given, s, np.zeros_like(y))
             y = (y - none) / (e.sensor(p, given, s, np.ones_like(y)) - none)
     return y
+
+
+def driven(effects: Sequence[Effect], p: Values, at: Conditions, drive: Any) -> Any:
+    """The drive's harmonics at the speaker's terminals.
+
+    From one curve of the amplifier to the next it goes as a wave: with its mean, and with more
+    harmonics than are compared.
+    """
+    curves = [e for e in effects if type(e).amplifier is not Effect.amplifier]
+    if curves and np.any(dual.value(drive)):
+        drive = _bent([partial(e.amplifier, p) for e in sorted(curves, key=_rails)], drive)
+    for e in effects:
+        drive = e.drive(p, at, drive)
+    return drive
+
+
+def _rails(effect: Effect) -> bool:
+    return effect.rails
+
+
+def _bent(curves: Sequence[Callable[[FloatArray], Bent]], drive: Any) -> Any:
+    """Harmonics of a drive behind `curves`, with their derivatives."""
+    K = drive.shape[1]
+    wave = to_time(drive, K, FINE)
+    v = dual.value(wave)
+    slope = np.ones_like(v)
+    moved: list[tuple[FloatArray, Dual]] = []
+    for curve in curves:
+        bent = curve(v)
+        moved = [(m * bent.slope, x) for m, x in moved]
+        moved += [(own(), x) for own, x in bent.by if isinstance(x, Dual)]
+        v, slope = bent.output, slope * bent.slope
+    # parameters vary all samples alike: their derivatives are taken to harmonics before the seeds
+    total = dual.chain(to_harmonics(v, K, FINE), *((to_harmonics(m, K, FINE), x) for m, x in moved))
+    if not isinstance(wave, Dual):
+        return total
+    return total + to_harmonics(Dual(np.zeros_like(v), wave.d * slope[..., None]), K, FINE)
 
 
 def declared_modes(p: Values, count: int) -> list[Mode]:

@@ -1,19 +1,18 @@
 """Actuator: what stands between the recorded drive and the sound at the speaker."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from identify import balance, dual
-from identify.dual import Dual
+from identify import dual
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Values
+from identify.structure import Bent, Conditions, Effect, Known, Values
 
 FloatArray = npt.NDArray[np.float64]
 
-FINE = 2048  # samples a period: corners alias below 1e-6
 UNEQUAL = (0.87, 0.95, 1.05, 1.15)  # of one level, where the two of a pair are sought
 
 
@@ -137,14 +136,13 @@ class Distortion(Effect):
     def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.powers)
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        K = at.harmonics
-        wave = balance.to_time(u, K)
-        total = u
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        output, slope = v, np.ones_like(v)
         for d in self.powers:
-            harmonics = balance.to_harmonics(wave**d, K)
-            total = total + harmonics * p[f"actuator_nonlinearity.a{d}"]
-        return total
+            share = dual.value(p[f"actuator_nonlinearity.a{d}"])
+            output, slope = output + share * v**d, slope + share * d * v ** (d - 1)
+        by = tuple((partial(np.power, v, d), p[f"actuator_nonlinearity.a{d}"]) for d in self.powers)
+        return Bent(output, slope, by)
 
 
 class PowerCompression(Effect):
@@ -172,37 +170,39 @@ class Clipping(Effect):
     """The amplifier saturates: L tanh(u/L)."""
 
     name, location, form = "actuator_nonlinearity", "actuator", "saturation"
+    rails = True
     parameters = (Parameter("actuator_nonlinearity.inverse_level", "1/V", 0.0, np.inf, "even"),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.3 / known.drive_amplitude,), (1.0 / known.drive_amplitude,)]
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        K = at.harmonics
-        inverse = p["actuator_nonlinearity.inverse_level"]
-        wave = balance.to_time(u, K)
-        return balance.to_harmonics(dual.tanh(wave * inverse) / inverse, K)
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        given = p["actuator_nonlinearity.inverse_level"]
+        inverse = dual.value(given)
+        curve = np.tanh(v * inverse)
+        slope = 1.0 - curve * curve
+        output = curve / inverse
+        return Bent(output, slope, ((lambda: (v * slope - output) / inverse, given),))
 
 
 class HardClipping(Effect):
     """The amplifier's rails: the drive is cut off at ± a level."""
 
     name, location, form = "actuator_nonlinearity", "actuator", "clipping"
+    rails = True
     parameters = (Parameter("actuator_nonlinearity.level_v", "V", 1e-9, np.inf, "positive"),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(share * known.drive_amplitude,) for share in (0.25, 0.5, 0.7, 0.85, 0.96)]
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        if not np.any(dual.value(u)):
-            return u
-        K, level = at.harmonics, p["actuator_nonlinearity.level_v"]
-        wave = balance.to_time(u, K, FINE)
-        v = dual.value(wave)
-        cut = np.clip(v, -dual.value(level), dual.value(level))
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        given = p["actuator_nonlinearity.level_v"]
+        level = dual.value(given)
+        cut = np.abs(v) > level
         # only the cut samples depend on the level; their harmonics are its derivative
-        moved = np.sign(v) * (np.abs(v) > dual.value(level))
-        return _behind(wave, cut, 1 - np.abs(moved), K, (lambda: moved, level))
+        return Bent(
+            np.clip(v, -level, level), np.where(cut, 0.0, 1.0), ((lambda: np.sign(v) * cut, given),)
+        )
 
 
 class UnequalClipping(Effect):
@@ -210,6 +210,7 @@ class UnequalClipping(Effect):
     another below."""
 
     name, location, form = "actuator_nonlinearity", "actuator", "unequal_clipping"
+    rails = True
     parameters = (
         Parameter("actuator_nonlinearity.upper_v", "V", 1e-9, np.inf, "positive"),
         Parameter("actuator_nonlinearity.lower_v", "V", 1e-9, np.inf, "positive"),
@@ -225,22 +226,17 @@ class UnequalClipping(Effect):
         both = [values[q.name] for q in other.parameters if q.unit == "V"]
         return [(q * level, level / q) for level in both for q in UNEQUAL]
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        if not np.any(dual.value(u)):
-            return u
-        K = at.harmonics
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
         upper, lower = p["actuator_nonlinearity.upper_v"], p["actuator_nonlinearity.lower_v"]
-        wave = balance.to_time(u, K, FINE)
-        v = dual.value(wave)
-        above, below = v > dual.value(upper), v < -dual.value(lower)
-        cut = np.clip(v, -dual.value(lower), dual.value(upper))
-        return _behind(
-            wave,
-            cut,
-            np.asarray(~(above | below), dtype=np.float64),
-            K,
-            (lambda: above.astype(float), upper),
-            (lambda: -below.astype(float), lower),
+        top, bottom = dual.value(upper), -dual.value(lower)
+        above, below = v > top, v < bottom
+        return Bent(
+            np.clip(v, bottom, top),
+            np.where(above | below, 0.0, 1.0),
+            (
+                (lambda: np.where(above, 1.0, 0.0), upper),
+                (lambda: np.where(below, -1.0, 0.0), lower),
+            ),
         )
 
 
@@ -253,8 +249,12 @@ class Crossover(Effect):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(share * known.drive_amplitude,) for share in (0.005, 0.03, 0.1)]
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        return HardClipping().drive(p, at, u) * -1.0 + u  # what a clipped wave has lost
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        given = p["actuator_nonlinearity.level_v"]
+        level = dual.value(given)
+        passed = np.abs(v) > level
+        left = v - np.clip(v, -level, level)
+        return Bent(left, np.where(passed, 1.0, 0.0), ((lambda: -np.sign(v) * passed, given),))
 
 
 class Knee(Effect):
@@ -264,6 +264,7 @@ class Knee(Effect):
     """
 
     name, location, form = "actuator_nonlinearity", "actuator", "knee"
+    rails = True
     parameters = (
         Parameter("actuator_nonlinearity.level_v", "V", 1e-9, np.inf, "positive"),
         Parameter("actuator_nonlinearity.order", "1", 1.0, 60.0, "positive"),
@@ -273,14 +274,9 @@ class Knee(Effect):
         u = known.drive_amplitude
         return [(share * u, n) for share in (0.35, 0.6, 0.9) for n in (3.0, 8.0)]
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        if not np.any(dual.value(u)):
-            return u
-        K = at.harmonics
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
         L, n = p["actuator_nonlinearity.level_v"], p["actuator_nonlinearity.order"]
         level, order = dual.value(L), dual.value(n)
-        wave = balance.to_time(u, K, FINE)
-        v = dual.value(wave)
         ratio = np.maximum(np.abs(v) / level, 1e-12)
         power = ratio**order
         q = 1.0 + power
@@ -294,29 +290,7 @@ class Knee(Effect):
             bend = np.log(q) / order**2 - power * np.log(ratio) / (order * q)
             return np.asarray(out * bend)
 
-        return _behind(wave, out, gain / q, K, (by_level, L), (by_order, n))
-
-
-def _behind(
-    wave: Any,
-    out: FloatArray,
-    slope: FloatArray,
-    harmonics: int,
-    *by: tuple[Callable[[], FloatArray], Any],
-) -> Any:
-    """Harmonics of what is `out` behind a curve of that `slope` at each sample of a wave, with its
-    derivatives `by` the curve's own parameters."""
-    # parameters vary all samples alike: their derivatives are taken to harmonics before the seeds
-    terms = [
-        (balance.to_harmonics(partial(), harmonics, FINE), x)
-        for partial, x in by
-        if isinstance(x, Dual)
-    ]
-    total = dual.chain(balance.to_harmonics(out, harmonics, FINE), *terms)
-    if not isinstance(wave, Dual):
-        return total
-    moved = Dual(np.zeros_like(out), wave.d * slope[..., None])
-    return total + balance.to_harmonics(moved, harmonics, FINE)
+        return Bent(out, gain / q, ((by_level, L), (by_order, n)))
 
 
 EFFECTS: tuple[Effect, ...] = (

@@ -24,6 +24,7 @@ from identify.effects.scatter import Change, DriveGain, DrivePhase, Scatter, Sen
 from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
 from identify.structure import (
+    Bent,
     Characteristic,
     Conditions,
     Effect,
@@ -141,8 +142,8 @@ class ShapedActuator(Shaped):
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
         return self.response(p, s)
 
-    def drive(self, p: Values, at: Conditions, u: Any) -> Any:
-        return self.distortion.drive(p, at, u)
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        return self.distortion.amplifier(p, v)
 
 
 class CutActuator(ShapedActuator):

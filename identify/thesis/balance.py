@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from identify import balance
+from identify import periods
 from identify.thesis.rows import regressors
 from identify.thesis.runs import EntrainedRuns
 
@@ -150,9 +150,9 @@ def solve(
     """
     w0, K = runs.scale_rad, BALANCED
     x = np.asarray(runs.s[:, :K] / w0)
-    in_time = balance.to_time(signal, signal.shape[1])
+    in_time = periods.to_time(signal, signal.shape[1])
     peak = float(np.max(np.abs(in_time)))
-    basis = [balance.to_harmonics((in_time / peak) ** d, signal.shape[1])[:, :K] for d in POWERS]
+    basis = [periods.to_harmonics((in_time / peak) ** d, signal.shape[1])[:, :K] for d in POWERS]
     forward, actuation = (np.broadcast_to(q, runs.s.shape)[:, :K] for q in (forward, actuation))
     drive_size = float(np.max(np.abs(runs.drive)))
     columns, target = regressors(
