@@ -465,7 +465,7 @@ def _traced(chosen: Tried, tried: Sequence[Tried]) -> tuple[TracedEffect, ...]:
 
 
 def _tone_effects(tones: Sequence[Tone]) -> tuple[TracedEffect, ...]:
-    """Foreign tones as the effect `interference`."""
+    """Foreign tones, as far as they were seen, as the effect `interference`."""
     return tuple(
         TracedEffect(
             "interference",
@@ -477,6 +477,7 @@ def _tone_effects(tones: Sequence[Tone]) -> tuple[TracedEffect, ...]:
             },
         )
         for t in tones
+        if not t.supposed
     )
 
 

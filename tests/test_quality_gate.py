@@ -13,6 +13,7 @@ import pytest
 from identify.identification import prepare
 from identify.quality import Quality, inspect
 from identify.record import Campaign, Medium, Run, Signal
+from tests import quality_material
 from tests.quality_material import (
     FREE_HZ,
     FREE_PA,
@@ -360,6 +361,25 @@ def test_a_multiple_of_the_mains_is_believed_where_one_run_shows_it() -> None:
     assert found.tones[1].runs == ("free",)
     spoilt = [(f.run, f.harmonics) for f in found.flags if f.flag == "tone_on_harmonic"]
     assert ("180Hz", (1,)) in spoilt
+
+
+def test_a_multiple_of_the_mains_that_no_run_could_show_is_supposed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A free cycle of 149.6 Hz hides 150 Hz in every run; forced there, one run's fundamental
+    counts for less. That it is there is not claimed."""
+    monkeypatch.setattr(quality_material, "FREE_HZ", 149.6)
+    rng = np.random.default_rng(8)
+    runs = [run_of("free", None, 0.0, rng)]
+    runs += [run_of(f"{f:g}Hz", f, 3.0, rng) for f in (146.0, 148.0, 150.0, 152.0, 155.0)]
+    found = inspect(edited(Campaign("around 150 Hz", tuple(runs), Medium()), line(50.0, 2.0)))
+    assert [t.frequency_hz for t in found.tones if not t.supposed] == [pytest.approx(50, abs=0.1)]
+    supposed = [round(t.frequency_hz) for t in found.tones if t.supposed]
+    assert supposed == [150, 300, 450, 600]  # each beside a harmonic of the free cycle
+    assert found.tones[1].amplitude == pytest.approx(found.tones[0].amplitude / 3, rel=1e-3)
+    spoilt = {f.run: f for f in found.flags if f.flag == "tone_on_harmonic"}
+    assert set(spoilt) == {"150Hz", "free"}
+    assert "unseen in any run" in spoilt["150Hz"].detail
 
 
 @pytest.mark.parametrize(("frequency", "believed"), [(50.0, True), (60.0, True), (57.3, False)])

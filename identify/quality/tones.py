@@ -10,7 +10,8 @@ no single run could tell it apart, is foreign where runs at several forcings hav
 Hum is so usual that it is believed where most runs have a little of it, though none would show it
 by itself. A line of the mains brings its multiples. One of those is believed wherever the rig's own
 lines leave it to be seen, be it in a single run: forced at three times 50 Hz, no run shows what it
-takes for its own.
+takes for its own. Where none leaves it to be seen, it is supposed to be as large as the rest of the
+hum, and the harmonic on which it would stand counts for so much less.
 """
 
 from collections.abc import Sequence
@@ -53,7 +54,8 @@ MAINS_ORDERS = 20
 @dataclass(frozen=True)
 class Tone:
     """A foreign tone. `amplitude` (peak) and `stderr` are of the velocity, in `unit`; `runs`
-    those where it is significant; `p_value` that of noise doing this anywhere in the spectra."""
+    those where it is significant; `p_value` that of noise doing this anywhere in the spectra. One
+    that is only `supposed` stands where no run could show it."""
 
     frequency_hz: float
     frequency_stderr_hz: float
@@ -62,6 +64,7 @@ class Tone:
     unit: str
     runs: tuple[str, ...]
     p_value: float
+    supposed: bool = False
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ class Place:
 def tones(
     views: Sequence[View], free: FreeLine | None
 ) -> tuple[tuple[Tone, ...], list[QualityFlag]]:
-    """Tones common to most runs, and flags of every run's foreign lines."""
+    """Tones common to most runs, those supposed under a harmonic, and flags of every run's foreign
+    lines."""
     searched = [lines(v, free) for v in views]
     if not searched:
         return (), []
@@ -137,7 +141,7 @@ def tones(
     believed(searched, hum(searched, found, width))
     believed(searched, multiples(out))
     believed(bare, constant(bare, width))
-    return tuple(out), flags
+    return (*out, *unseen(bare, out)), flags
 
 
 def places(found: Sequence[Peak], width_hz: float) -> list[Place]:
@@ -196,16 +200,42 @@ def multiples(found: Sequence[Tone]) -> list[float]:
     return out
 
 
+def unseen(searched: Sequence[Lines], found: Sequence[Tone]) -> list[Tone]:
+    """Multiples of a hum that no run could show, under a harmonic of some run."""
+    out = []
+    for frequency in multiples(found):
+        under = (order_under(frequency, s.view) is not None for s in searched)
+        if any(under) and not seen_at(searched, frequency):
+            hums = [t for t in found if mains_order(t.frequency_hz, 0.0) is not None]
+            pressures = searched[0].view.microphones is not None  # velocity is theirs over ω
+            most = max(
+                t.amplitude * (t.frequency_hz / frequency if pressures else 1.0) for t in hums
+            )
+            first = hums[0]
+            out.append(
+                Tone(
+                    frequency, first.frequency_stderr_hz, most, most / 2, first.unit, (), 1.0, True
+                )
+            )
+    return out
+
+
+def order_under(frequency_hz: float, view: View) -> int | None:
+    """Which of a run's harmonics a tone cannot be told from, if any."""
+    count = view.coefficients.shape[1]
+    return harmonic_under(frequency_hz, view.frequency_hz, 1 / view.bin_hz, count)
+
+
 def on_harmonics(views: Sequence[View], known: Sequence[Tone]) -> list[QualityFlag]:
-    """`tone_on_harmonic`: a known tone stands where it cannot be told from a run's harmonic."""
+    """`tone_on_harmonic`: a tone stands where it cannot be told from a run's harmonic."""
     out = []
     for v in views:
         for tone in known:
-            count = v.coefficients.shape[1]
-            order = harmonic_under(tone.frequency_hz, v.frequency_hz, 1 / v.bin_hz, count)
+            order = order_under(tone.frequency_hz, v)
             if order is not None:
+                what = "a multiple of the hum, unseen in any run," if tone.supposed else "the tone"
                 detail = (
-                    f"harmonic {order}, {order * v.frequency_hz:.2f} Hz, coincides with the tone "
+                    f"harmonic {order}, {order * v.frequency_hz:.2f} Hz, coincides with {what} "
                     f"at {tone.frequency_hz:.2f} Hz, which counts as noise there "
                     f"({tone.amplitude:.3g} {tone.unit}); force at another frequency"
                 )
