@@ -10,7 +10,6 @@ import pytest
 import identify
 from identify import assess, balance, diagnosis, start, trace
 from identify.chances import chi2_tail
-from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -33,12 +32,10 @@ from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
-from identify.trace import selection
 from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import scan
 from identify.trace.selection import (
-    _chance_to_the_end,
     _other_forms_beside_chance,
     _without_law,
     against_chance,
@@ -1004,36 +1001,6 @@ def test_a_law_beside_a_spread_must_gain_on_the_spread_alone(
     spread = Spread(beside, None, sizes, penalty, "")  # type: ignore[arg-type]
     both = trace.Tried((*law.effects, FLAME), beside, error, 0.5, 0.5, spread)
     assert trace.accounts(both, far, [law, alone, both]) is claimed
-
-
-@pytest.mark.parametrize("ends", [True, False])
-def test_chance_is_led_down_its_valley_before_a_law_is_claimed_beside_it(
-    monkeypatch: pytest.MonkeyPatch, ends: bool
-) -> None:
-    """Its descent stops short, and again a little further on: a lag of the speaker was claimed
-    beside a gross scatter of the drive (39019). From too far down none may come to an end."""
-    bottom = 40.0
-
-    def valley(theta: float) -> Fit:
-        fit = replace(fitted(1, 1.0), theta=np.array([theta]), converged=False)
-        return replace(fit, chi2=100.0 + (bottom - theta) ** 2)
-
-    def at(theta: float, *laws: str) -> trace.Tried:
-        fit = valley(theta)
-        spread = Spread(fit, None, {}, 0.0, "")  # type: ignore[arg-type]
-        return trace.Tried((*map(by_key, laws), DRIVE), fit, 1e-3, 0.5, 0.5, spread)
-
-    def scattered(structure: object, data: object, base: Fit, *rest: object) -> list[trace.Tried]:
-        begun = float(base.theta[0])
-        return [at(begun + 0.1 * (bottom - begun))] if ends or begun < 8.0 else []
-
-    monkeypatch.setattr(selection, "try_scatters", scattered)
-    monkeypatch.setattr(trace.Tried, "plausible", True)
-    both, alone = at(41.0, "flame_delay"), at(0.0)
-    (led,) = _chance_to_the_end([both, alone], Dataset((), (), 0.0), InProcess())
-    assert led.names == ("drive_scatter",)
-    assert led.deviance < (101.0 if ends else 1300.0)
-    assert _chance_to_the_end([at(41.0), alone], Dataset((), (), 0.0), InProcess()) == []
 
 
 @pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])

@@ -75,8 +75,6 @@ MUCH = 30.0  # χ²/dof that pairs leave, beyond which others are sought from af
 NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
-STEPS_ON = 24  # of a spread that is led to the end, each so many times the last one …
-FURTHER, LIKELIER = 2.0, 0.1  # … further, while that takes so much off χ² and penalty
 MINIMA = 2  # of the declared model, beside the deepest, from which effects are sought …
 PROMISING = 2.0  # … that promise to leave no more there than so many times what the best leaves
 MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect …
@@ -490,7 +488,6 @@ class _Searching:
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
-        self.tried += _chance_to_the_end(self.tried, data, run)
         self.tried += in_finer_forms(self.tried, data, self.forms, run)
         self.tried += settled(self.tried, data, run)
 
@@ -787,38 +784,6 @@ def _beside_the_same_chance(
         if t.explains:
             out += try_scatters(t.fit.structure, data, t.fit, [chance], run)
     return [*out, *_without_chance(out, data)]
-
-
-def _chance_to_the_end(tries: Sequence[Tried], data: Dataset, run: Executor) -> list[Tried]:
-    """What chance comes to without the law that it would be claimed beside, led to the end: down a
-    long valley θ and σ, found in turn, stop short (39019: χ² and penalty 357, at the end 308)."""
-    good = [t for t in tries if t.explains]
-    best = best_form(good) if good else None
-    if best is None or best.spread is None or len(best.effects) == 1:
-        return []
-    alone = [t for t in tries if t.spread and t.parts < best.parts and not t.fit.converged]
-    led = [(t, _led_down(t, data, run)) for t in best_of_each_form(alone)]
-    return [end for t, end in led if end is not t]
-
-
-def _led_down(t: Tried, data: Dataset, run: Executor) -> Tried:
-    """A spread from where it ended, each time some way further along what the last step was, for as
-    long as that makes it likelier."""
-    chance, current = t.effects[-1], t
-    assert isinstance(chance, Scatter)
-    along: FloatArray | None = None
-    for _ in range(STEPS_ON):
-        theta = current.fit.theta if along is None else current.fit.theta + FURTHER * along
-        begun = replace(current.fit, theta=theta)
-        found = try_scatters(t.fit.structure, data, begun, [chance], run)
-        if found and found[0].deviance < current.deviance - LIKELIER:
-            along = found[0].fit.theta - current.fit.theta
-            current = found[0]
-        elif along is None:
-            break
-        else:
-            along = None
-    return current
 
 
 def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:
