@@ -225,6 +225,7 @@ class Effect:
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
     rails: bool = False  # an `amplifier` that ends at its supply: what bends besides comes before
+    smooth: bool = False  # an `amplifier` that few samples a period describe
 
     def extends(self, structure: "Structure") -> bool:
         """Whether it says what this declared model does not say already."""
@@ -601,7 +602,9 @@ def driven(effects: Sequence[Effect], p: Values, at: Conditions, drive: Any) -> 
     """
     curves = [e for e in effects if type(e).amplifier is not Effect.amplifier]
     if curves and np.any(dual.value(drive)):
-        drive = _bent([partial(e.amplifier, p) for e in sorted(curves, key=_rails)], drive)
+        samples = None if len(curves) == 1 and curves[0].smooth else FINE
+        in_turn = [partial(e.amplifier, p) for e in sorted(curves, key=_rails)]
+        drive = _bent(in_turn, drive, samples)
     for e in effects:
         drive = e.drive(p, at, drive)
     return drive
@@ -611,10 +614,10 @@ def _rails(effect: Effect) -> bool:
     return effect.rails
 
 
-def _bent(curves: Sequence[Callable[[FloatArray], Bent]], drive: Any) -> Any:
+def _bent(curves: Sequence[Callable[[FloatArray], Bent]], drive: Any, samples: int | None) -> Any:
     """Harmonics of a drive behind `curves`, with their derivatives."""
     K = drive.shape[1]
-    wave = to_time(drive, K, FINE)
+    wave = to_time(drive, K, samples)
     v = dual.value(wave)
     slope = np.ones_like(v)
     moved: list[tuple[FloatArray, Dual]] = []
@@ -624,10 +627,12 @@ def _bent(curves: Sequence[Callable[[FloatArray], Bent]], drive: Any) -> Any:
         moved += [(own(), x) for own, x in bent.by if isinstance(x, Dual)]
         v, slope = bent.output, slope * bent.slope
     # parameters vary all samples alike: their derivatives are taken to harmonics before the seeds
-    total = dual.chain(to_harmonics(v, K, FINE), *((to_harmonics(m, K, FINE), x) for m, x in moved))
+    total = dual.chain(
+        to_harmonics(v, K, samples), *((to_harmonics(m, K, samples), x) for m, x in moved)
+    )
     if not isinstance(wave, Dual):
         return total
-    return total + to_harmonics(Dual(np.zeros_like(v), wave.d * slope[..., None]), K, FINE)
+    return total + to_harmonics(Dual(np.zeros_like(v), wave.d * slope[..., None]), K, samples)
 
 
 def declared_modes(p: Values, count: int) -> list[Mode]:

@@ -1,6 +1,6 @@
 """Actuator: what stands between the recorded drive and the sound at the speaker."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -120,6 +120,7 @@ class Distortion(Effect):
     """Polynomial distortion of the drive: u + α₂ u² + α₃ u³ (compression where α₃ < 0)."""
 
     name, location = "actuator_nonlinearity", "actuator"
+    smooth = True
 
     def __init__(self, powers: tuple[int, ...]) -> None:
         self.powers = powers
@@ -137,12 +138,17 @@ class Distortion(Effect):
         return (0.0,) * len(self.powers)
 
     def amplifier(self, p: Values, v: FloatArray) -> Bent:
-        output, slope = v, np.ones_like(v)
+        power = [np.ones_like(v), v]  # products: far faster than powers
+        while len(power) <= max(self.powers):
+            power.append(power[-1] * v)
+        output, slope = v, power[0]
+        by: list[tuple[Callable[[], FloatArray], Any]] = []
         for d in self.powers:
-            share = dual.value(p[f"actuator_nonlinearity.a{d}"])
-            output, slope = output + share * v**d, slope + share * d * v ** (d - 1)
-        by = tuple((partial(np.power, v, d), p[f"actuator_nonlinearity.a{d}"]) for d in self.powers)
-        return Bent(output, slope, by)
+            given = p[f"actuator_nonlinearity.a{d}"]
+            share = dual.value(given)
+            output, slope = output + share * power[d], slope + d * share * power[d - 1]
+            by.append((partial(np.asarray, power[d]), given))
+        return Bent(output, slope, tuple(by))
 
 
 class PowerCompression(Effect):
@@ -170,7 +176,7 @@ class Clipping(Effect):
     """The amplifier saturates: L tanh(u/L)."""
 
     name, location, form = "actuator_nonlinearity", "actuator", "saturation"
-    rails = True
+    rails = smooth = True
     parameters = (Parameter("actuator_nonlinearity.inverse_level", "1/V", 0.0, np.inf, "even"),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
