@@ -270,6 +270,19 @@ def test_settling_runs(clean: Campaign, size: float, seconds: float, severity: s
     assert flags == ({} if severity is None else {"unsettled": severity})
 
 
+def test_the_ringing_of_a_quiet_rig_is_no_limit_cycle(clean: Campaign) -> None:
+    """It dies away, a thousand times below what is forced: nearly all of its velocity is noise,
+    by whose measure its fall would do no harm."""
+    rng = np.random.default_rng(3)
+
+    def ring(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        noise = 0.03 * rng.standard_normal(t.size)
+        return 0.2 * np.exp(-t / 2.5) * np.cos(2 * np.pi * FREE_HZ * t) + noise
+
+    found = inspect(edited(clean, pressures(ring), 0))
+    assert [(f.run, f.flag, f.severity) for f in found.flags] == [("free", "unsettled", "excluded")]
+
+
 def test_a_slow_drift_excludes_nothing(clean: Campaign) -> None:
     """A per cent in the run: the mean is that of its middle. 0.6 % in 1200 s is not even seen."""
     found, flags, _ = judged(clean, pressures(lambda x, t: x * (1 + 0.005 * t)))

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +11,7 @@ import pytest
 import identify
 from identify import assess, balance, diagnosis, start, trace
 from identify.chances import chi2_tail
+from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -31,7 +33,8 @@ from identify.parameters import Estimate
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
-from identify.structure import Conditions
+from identify.structure import Conditions, Structure
+from identify.trace import selection
 from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import scan
@@ -916,6 +919,33 @@ def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
     change = best.estimates["parameter_drift.relative_change"]
     over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
     assert abs(change.value - 0.02 * over) < 4 * change.stderr
+
+
+def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Frequencies that wander beside a damping that falls passed for a scatter of the drive, which
+    may be anything at the fundamental (41069)."""
+    spread = Spread(fitted(0, 1.0), None, {}, 0.0, "")  # type: ignore[arg-type]
+    alone = trace.Tried((DRIVE,), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
+    law = tried_as(fitted(1, 400.0), "parameter_drift:damping")
+    asked: list[str] = []
+
+    def scattered(*arguments: Any) -> list[trace.Tried]:
+        asked.extend(s.key for s in arguments[3])
+        return []
+
+    monkeypatch.setattr(selection, "try_scatters", scattered)
+    for seek in ("_beside_chance", "_other_forms_beside_chance", "_in_the_place_of_chance"):
+        monkeypatch.setattr(selection, seek, lambda *rest: [])
+    none = Dataset((), (), 0.0)
+    going = selection._Searching(
+        Structure(2), none, fitted(0, 500.0), InProcess(), lambda *rest: None, (), (), SCATTERS
+    )
+    going.tried = [alone, law]
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    going.with_chance([law])
+    assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
 
 
 def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:

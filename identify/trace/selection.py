@@ -368,18 +368,19 @@ class _Searching:
         return [*others, *led_on(others, self.data, self.run)]
 
     def with_chance(self, parents: Sequence[Tried]) -> None:
-        """Run-to-run scatter beside each of `parents`, and effects beside scatter: where that
-        explains the data alone, those that promise most within it."""
+        """Run-to-run scatter beside each of `parents`, and effects beside scatter. Where one kind
+        of it explains the data alone, the others do beside a law: what deviates in two ways may
+        take the one for the other (41069), and what promises most within it is asked."""
         data, run = self.data, self.run
         self.report(0.6, "trying run-to-run scatter beside an effect")
         good = [t for t in self.tried if t.explains]
         by_law = [t for t in good if t.spread is None]
-        for parent in [] if self.by_chance else parents:
+        for parent in parents:
             if by_law and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
             if by_law and parent.fit.chi2_per_dof > NO_CHANCE:
                 continue  # nor can what takes that much up be chance
-            found = self._scattered(parent.fit.structure, parent.fit)
+            found = self._scattered(parent.fit.structure, parent.fit, self._others_by_chance)
             found += _simpler_beside_chance(found, data, self.apart, run)
             self._add_beside_chance(found)
         if not by_law:
@@ -443,12 +444,21 @@ class _Searching:
         known = {t.key_of_forms for t in self.tried if t.spread}
         self.tried += _without_law(found, known, self.data, self.run)
 
-    def _scattered(self, structure: Structure, base: Fit) -> list[Tried]:
-        """Run-to-run scatter on top of `structure`; beside what explains the data already, as far
-        as it is a rival."""
+    @property
+    def _others_by_chance(self) -> list[Scatter]:
+        """Kinds of scatter that do not explain the data by themselves."""
+        alone = {t.key_of_forms for t in self.spreads_alone if t.explains}
+        return [s for s in self.scatters if (s.key,) not in alone]
+
+    def _scattered(
+        self, structure: Structure, base: Fit, kinds: Sequence[Scatter] | None = None
+    ) -> list[Tried]:
+        """Run-to-run scatter, of some kinds or of all, on top of `structure`; beside what explains
+        the data already, as far as it is a rival."""
         good = [t.evidence for t in self.tried if t.explains]
         most = min(good, default=np.inf) + EVIDENCE
-        return try_scatters(structure, self.data, base, self.scatters, self.run, most)
+        asked = self.scatters if kinds is None else kinds
+        return try_scatters(structure, self.data, base, asked, self.run, most)
 
     def in_one_place(self) -> list[Tried]:
         """Two effects of the place whose freely shaped piece explains the data; the pieces."""
