@@ -773,6 +773,16 @@ def test_fitted_and_held_out_runs_speak_together(monkeypatch: pytest.MonkeyPatch
     nearer = replace(mode, held_out=(14.0, 20))
     assert trace.rivals(replace(skew, held_out=(22.0, 20)), [nearer]) == [nearer]
 
+    # what fits as well is no rival if it predicts far worse, but for chance: it widens the noise
+    alike = tried_as(fitted(11, 0.95), "flame_delay")
+    known = replace(skew, held_out=(18.0, 20))
+    assert trace.rivals(known, [alike, replace(alike, held_out=(22.0, 20))]) == [alike]
+    poor = replace(alike, held_out=(29.0, 20))
+    assert trace.rivals(known, [poor]) == []
+    spread = Spread(alike.fit, None, {}, 0.0, "")  # type: ignore[arg-type]
+    chance = trace.Tried((DRIVE,), alike.fit, 1e-3, 0.5, 0.5, spread, (29.0, 20))
+    assert trace.rivals(known, [chance]) == [chance]
+
     order = tried_as(fitted(12, 1.4), "flame_dynamics:second_order")
     hardly = replace(order, fit_p=0.003, validation_p=0.009, held_out=(21.0, 20))
     assert hardly.adequate

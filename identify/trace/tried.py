@@ -134,7 +134,7 @@ class Tried:
 
     @property
     def evidence_of_all(self) -> float:
-        """The same as if all runs had been fitted, to first order."""
+        """The same as if all runs had been fitted, to first order (of laws)."""
         return self.evidence + self.held_out[0]
 
     @property
@@ -279,23 +279,32 @@ def foremost(tries: Sequence[Tried]) -> Tried | None:
 def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     """Adequate, plausible sets of other effects that the data do not rule out against `best`.
 
-    What only adds an effect to one of them is none of its own. Among spreads the likelihood alone
-    decides: how well the wanderings of a few runs fit a Gaussian says little of their cause; a law
-    beside one must predict the held-out runs. A law may follow what chance did where a spread is
-    about as likely, or likelier though it looks not quite random. Each in its best form that is a
-    rival: one that extends `best` must not hide another.
+    Laws are weighed by all runs: refitted to them, their evidence hardly differs. What only adds an
+    effect to one of them is none of its own. Among spreads the likelihood alone decides: how well
+    the wanderings of a few runs fit a Gaussian says little of their cause; a law beside one must
+    predict the held-out runs. A law may follow what chance did where a spread is about as likely,
+    or likelier though it looks not quite random. Each in its best form that is a rival: one that
+    extends `best` must not hide another.
     """
     every = [
         t
         for t in others
         if t.key != best.key
         and (t.explains or _chance_rivals(t, best) or _stands_for_another(t, best))
-        and min(t.evidence - best.evidence, t.evidence_of_all - best.evidence_of_all) < EVIDENCE
+        and _less_likely(t, best) < EVIDENCE
         and not best.within(t)
         and not _extends(t, best)
     ]
     found = best_by_name(every)
     return [t for t in found if not any(o.within(t) for o in found)]
+
+
+def _less_likely(t: Tried, best: Tried) -> float:
+    """By how much of χ² + p ln n the data speak for `best`: all of them, the held-out runs too. A
+    spread takes these for whatever it widens them to: its fitted runs must speak for it as well."""
+    of_all = t.evidence_of_all - best.evidence_of_all
+    laws = t.spread is None and best.spread is None
+    return of_all if laws else min(of_all, t.evidence - best.evidence)
 
 
 def _stands_for_another(t: Tried, best: Tried) -> bool:
