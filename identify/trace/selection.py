@@ -58,6 +58,7 @@ from identify.trace.tried import (
     best_of_each_form,
     first_of_each,
     foremost,
+    foretold,
     misfit,
     tried,
 )
@@ -589,12 +590,14 @@ def _least(tries: Sequence[Tried]) -> float:
 
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
     """A law that does better than a spread speaks against chance, even one of implausible values,
-    or one of `others`: it stands for one that is not known."""
-    laws = [t.evidence for t in (*tries, *others) if t.spread is None and t.adequate]
-    least = min(laws, default=np.inf)
+    or one of `others`: it stands for one that is not known. So does one that predicts held-out runs
+    far better than they would scatter, whatever else it leaves."""
+    laws = [t for t in (*tries, *others) if t.spread is None]
+    least = min((t.evidence for t in laws if t.adequate), default=np.inf)
+    nearest = min((t.validation_error for t in laws if t.held_out[1]), default=np.inf)
     out = []
     for t in tries:
-        if t.spread is not None and t.evidence > least:
+        if t.spread is not None and (t.evidence > least or foretold(t, nearest)):
             spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
             out.append(replace(t, spread=spread))
         else:

@@ -381,6 +381,16 @@ def _predicts_worse(t: Tried, o: Tried) -> bool:
     return more > WORSE or (more > 1.0 and t.validation_p < o.validation_p)
 
 
+def foretold(t: Tried, error: float) -> bool:
+    """Whether held-out runs that a law predicts with that `error` do not scatter as the spread `t`
+    has it: they would lie so near to their middle by chance, each along one direction at least."""
+    if t.spread is None or not error < t.validation_error < np.inf:
+        return False
+    runs = sum(b.runs for b in t.spread.data.validation)
+    nearer = runs * (error / t.validation_error) ** 2
+    return 1.0 - chi2_tail(nearer, runs) < ALPHA
+
+
 def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
     """Whether a freely shaped piece is far likelier, complexity counted: then the cause is one that
     nobody has named, and `t` only comes near to it. Chance at one place is asked so of chance at
