@@ -29,7 +29,6 @@ from identify.polynomial import Polynomial
 from identify.structure import (
     Characteristic,
     Conditions,
-    Effect,
     Loop,
     Preceded,
     Structure,
@@ -476,12 +475,9 @@ def drive_sensitivity(
     K = at.harmonics
     s = 1j * orbits.omega[:, None] * np.arange(1, K + 1)
     values = structure.parameters.plain(theta)
-    # linear in the drive but for an amplifier, whose slope is near one: with a drive of one, and
-    # without the amplifier, the equations give its transfer functions
-    unbent = tuple(e for e in structure.effects if type(e).amplifier is Effect.amplifier)
-    unit = replace(structure, effects=unbent).assemble(
-        values, replace(at, drive=np.ones_like(at.drive)), s
-    )
+    # linear in the drive but for its distortion, whose slope is near one: with a drive of one, and
+    # without the distortion, the equations give its transfer functions
+    unit = structure.undistorted.assemble(values, replace(at, drive=np.ones_like(at.drive)), s)
     loop = structure.assemble(values, at, s)
     by_input = _slopes(loop.N, orbits.inputs)
     entering = np.concatenate([_diagonal(q, at.runs, K) for q in unit.Q], axis=1)

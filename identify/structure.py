@@ -319,6 +319,12 @@ class Effect:
     def key(self) -> str:
         return f"{self.name}:{self.form}" if self.form else self.name
 
+    @property
+    def distorts(self) -> bool:
+        """Whether it distorts the drive, which then does not enter linearly."""
+        own = type(self)
+        return own.amplifier is not Effect.amplifier or own.drive is not Effect.drive
+
 
 @dataclass(frozen=True)
 class Deviation:
@@ -428,6 +434,11 @@ class Structure:
     def cornered(self) -> bool:
         """Whether corners or memory precede the characteristic: harmonics then fall off slowly."""
         return any(type(e).operator is not Effect.operator for e in self.effects)
+
+    @property
+    def undistorted(self) -> "Structure":
+        """The same without what distorts the drive."""
+        return replace(self, effects=tuple(e for e in self.effects if not e.distorts))
 
     def with_effects(self, *effects: Effect) -> "Structure":
         return replace(self, effects=(*self.effects, *effects))

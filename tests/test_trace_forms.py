@@ -22,6 +22,7 @@ from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.scatter import Spread, fit_scatter
+from identify.structure import driven
 from identify.trace import contests, selection, stages
 from identify.trace.contests import at_the_same_place
 from identify.trace.stages import try_scatters
@@ -508,7 +509,7 @@ def test_an_amplifier_s_crossover() -> None:
     at = replace(NOWHERE, drive=u)
 
     def drive(level: Any) -> Any:
-        return effect.drive({"actuator_nonlinearity.level_v": level}, at, u)
+        return driven((effect,), {"actuator_nonlinearity.level_v": level}, at, u)
 
     small = drive(1e-3)
     assert abs(small[0, 0]) == pytest.approx(2 - 4 / np.pi * 1e-3, rel=1e-6)

@@ -17,7 +17,7 @@ from identify.dual import Dual
 from identify.fit import Fit
 from identify.results import Assessment
 from identify.statespace import linear_poles, standing_still
-from identify.structure import Conditions, Effect, Loop
+from identify.structure import Conditions, Loop
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]
@@ -155,8 +155,7 @@ def _seeded(fit: Fit, s: ComplexArray) -> tuple[Loop, Conditions]:
     at = _at(s)
     values = fit.structure.parameters.seeded(fit.theta[None], s.shape[0])
     # the acoustics are asked for: a distortion of the drive stands before them
-    effects = tuple(e for e in fit.structure.effects if type(e).drive is Effect.drive)
-    return replace(fit.structure, effects=effects).assemble(values, at, s), at
+    return fit.structure.undistorted.assemble(values, at, s), at
 
 
 def _at(s: ComplexArray) -> Conditions:
