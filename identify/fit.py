@@ -430,10 +430,23 @@ class _State:
     ended: str | None = None
     converged: bool = False
     costs: list[float] = field(default_factory=list)  # at the start of each iteration
+    afresh: int = -1  # iteration at which it last began anew
 
     @property
     def cost(self) -> float:
         return float(self.residual @ self.residual)
+
+    def begin_anew(self, damping: float) -> bool:
+        """Forget the scales and the damping of the way here; False where that has been of no use.
+
+        Scales hold the steepest slope of the whole way: one steep place, by an edge perhaps, bars
+        an unknown from then on. Far from the noise the end of a descent does not matter so much.
+        """
+        if self.afresh == self.iterations or self.cost > FAR * self.residual.size:
+            return False
+        self.scale, self.damping = np.zeros_like(self.scale), damping
+        self.grow, self.refused, self.afresh = 2.0, 0, self.iterations
+        return True
 
     @property
     def stuck(self) -> bool:
@@ -464,7 +477,8 @@ def levenberg_marquardt(
     step still to come would lower χ² by less than `tolerance` (absolute and relative): a hundredth
     of what a thousandth of a standard error is worth. Unknowns are scaled by the Jacobian's
     columns (Marquardt), damping follows the gain ratio (Nielsen); a descent ends after more than
-    `patience` refused steps in a row, where it creeps along an edge of what exists, or where after
+    `patience` refused steps in a row (near the noise, twice as many, of which the latter half with
+    scales and damping begun anew), where it creeps along an edge of what exists, or where after
     `hope` iterations even what its tangents promise of |ρ|² is beyond `hopeless`. Unknowns at a
     bound that the gradient pushes against are held there; `bounds` are (p,) each, or (starts, p).
     """
@@ -485,7 +499,9 @@ def levenberg_marquardt(
         active = [(n, s) for n, s in enumerate(states) if s is not None and s.ended is None]
         trials, steps = [], []
         for n, s in active:
-            step = _propose(s, low[n], high[n], tolerance, iterations, patience, hopeless, hope)
+            step = _propose(
+                s, low[n], high[n], tolerance, damping, iterations, patience, hopeless, hope
+            )
             if step is not None:
                 trials.append((n, s))
                 steps.append(step)
@@ -532,6 +548,7 @@ def _propose(
     low: FloatArray,
     high: FloatArray,
     tolerance: float,
+    damping: float,
     iterations: int,
     patience: int,
     hopeless: float,
@@ -549,9 +566,13 @@ def _propose(
         s.converged, s.ended = True, "converged"
         return None
     if s.refused > patience:
-        s.converged = promise < 1e-3 * enough
-        s.ended = "converged" if s.converged else AT_REST
-        return None
+        if promise < 1e-3 * enough:
+            s.converged, s.ended = True, "converged"
+            return None
+        if not s.begin_anew(damping):
+            s.ended = AT_REST
+            return None
+        s.factors = _factors(s, low, high)
     if s.stuck:
         s.ended = "stuck at an edge beyond which no orbit exists"
         return None
