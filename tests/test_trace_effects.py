@@ -546,7 +546,7 @@ def test_a_claim_takes_most_of_the_misfit_away(
     delay = tried_as(fitted(11, after), "flame_delay")
     assert trace.accounts(delay, tried_as(fitted(10, before)), []) is accounted
     gross = tried_as(fitted(9, 1e4))
-    skew = tried_as(fitted(10, before), "channel_mismatch:skew")
+    skew = replace(tried_as(fitted(10, before), "channel_mismatch:skew"), fit_p=0.0)
     both = tried_as(fitted(11, after), "channel_mismatch:skew", "flame_delay")
     assert trace.accounts(both, gross, [skew, both]) is accounted
     # nor what predicts the held-out runs worse than a part of it does
@@ -557,6 +557,10 @@ def test_a_claim_takes_most_of_the_misfit_away(
     assert trace.accounts(little, gross, [skew, little]) is accounted
     unlikely = replace(little, validation_p=0.1)
     assert not trace.accounts(unlikely, gross, [skew, unlikely])
+    # another form of a part, which leaves more of the fitted runs, may meet the others by luck
+    poor = tried_as(fitted(10, 2 * before), "channel_mismatch:gain")
+    poor = replace(poor, fit_p=0.0, validation_error=5e-4)
+    assert trace.accounts(both, gross, [skew, poor, both]) is accounted
 
 
 @pytest.mark.parametrize(
@@ -933,17 +937,22 @@ def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("runs", "error", "beaten"), [(3, 1e-3, True), (3, 1e-2, False), (1, 1e-3, False)]
+    ("runs", "error", "left", "beaten"),
+    [(3, 1e-3, 6.0, True), (3, 1e-2, 6.0, False), (1, 1e-3, 6.0, False), (3, 1e-3, 400.0, False)],
 )
-def test_runs_that_a_law_foretells_do_not_scatter(runs: int, error: float, beaten: bool) -> None:
+def test_runs_that_a_law_foretells_do_not_scatter(
+    runs: int, error: float, left: float, beaten: bool
+) -> None:
     """Three held-out runs within a thirtieth of what the drive's phase would scatter by: no chance,
     though the law leaves a misfit elsewhere (42077, a loss in the place of which a scatter beside
-    a wrong form of the microphones' mismatch was claimed). One run may be so by chance."""
+    a wrong form of the microphones' mismatch was claimed). One run may be so by chance, and so may
+    three by one of many laws that miss the fitted ones by far (43096, a natural frequency that
+    wanders)."""
     held_out = SimpleNamespace(validation=(SimpleNamespace(runs=runs),))
     spread = Spread(fitted(2, 1.0), held_out, {}, 0.0, "")  # type: ignore[arg-type]
     effects = (by_key("channel_mismatch:skew"), DRIVE)
     chance = trace.Tried(effects, fitted(2, 1.0), 0.033, 0.5, 0.5, spread, (2.0 * runs, 2 * runs))
-    law = replace(tried_as(fitted(3, 6.0), "acoustic_mode:mode"), validation_error=error)
+    law = replace(tried_as(fitted(3, left), "acoustic_mode:mode"), validation_error=error)
     (judged,) = against_chance([chance], [replace(law, held_out=(40.0, 2 * runs), fit_p=0.0)])
     assert (judged.objection != "") is beaten
 

@@ -354,11 +354,11 @@ def gain_p(gain: float, t: Tried, without: Fit) -> float:
 def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     """Whether the misfit that is left without one of the effects goes with it: more than chance
     takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
-    worse. What takes a part of little may leave the cause behind, under the threshold. A spread
-    does so by widening the noise: its likelihood is penalised for that, and must still gain, on
-    the law beside it and, so that one is claimed, on the spread alone, more than the likeliest of
-    all laws does by chance. And chance beside a law does not make the prediction many times worse
-    (alone, it does where the declared model had followed it)."""
+    worse than by fewer effects in their best forms. What takes a part of little may leave the cause
+    behind, under the threshold. A spread does so by widening the noise: its likelihood is penalised
+    for that, and must still gain, on the law beside it and, so that one is claimed, on the spread
+    alone, more than the likeliest of all laws does by chance. And chance beside a law does not make
+    the prediction many times worse (alone, it does where the declared model had followed it)."""
     fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
     without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
     mostly = t.excess < without.excess / 3
@@ -369,7 +369,7 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
         hidden = t.validation_error > ASTRAY * declared.validation_error
         lost = len(t.effects) > 1 and hidden
         return mostly and found and not lost and t.evidence < least - EVIDENCE
-    worse = any(_predicts_worse(t, o) for o in fewer)
+    worse = any(_predicts_worse(t, o) for o in best_by_name(fewer))
     gain = without.chi2_of_all - t.chi2_of_all
     return gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
 
