@@ -202,21 +202,17 @@ def multiples(found: Sequence[Tone]) -> list[float]:
 
 def unseen(searched: Sequence[Lines], found: Sequence[Tone]) -> list[Tone]:
     """Multiples of a hum that no run could show, under a harmonic of some run."""
+    hums = [t for t in found if mains_order(t.frequency_hz, 0.0) is not None]
+    pressures = searched[0].view.microphones is not None  # velocity is theirs over ω
     out = []
-    for frequency in multiples(found):
+    for frequency in multiples(hums):
         under = (order_under(frequency, s.view) is not None for s in searched)
         if any(under) and not seen_at(searched, frequency):
-            hums = [t for t in found if mains_order(t.frequency_hz, 0.0) is not None]
-            pressures = searched[0].view.microphones is not None  # velocity is theirs over ω
             most = max(
                 t.amplitude * (t.frequency_hz / frequency if pressures else 1.0) for t in hums
             )
-            first = hums[0]
-            out.append(
-                Tone(
-                    frequency, first.frequency_stderr_hz, most, most / 2, first.unit, (), 1.0, True
-                )
-            )
+            stderr, unit = hums[0].frequency_stderr_hz, hums[0].unit
+            out.append(Tone(frequency, stderr, most, most / 2, unit, (), 1.0, supposed=True))
     return out
 
 

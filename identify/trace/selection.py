@@ -138,7 +138,7 @@ def search(
         # a spread alone does not end the search: a pair may explain the same without chance
         explaining = [t for t in going.tried if t.explains]
         enough = any(t.spread is None or len(t.effects) > 1 or size > 2 for t in explaining)
-        if enough or going.late:
+        if enough or going.late():
             break
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
@@ -147,16 +147,16 @@ def search(
         found = going.pairs(singles) if nowhere else []
         if not going.explained or not nowhere:
             found = going.grown(parents, found)
-        if size == 2 and not going.late:
+        if size == 2 and not going.late():
             going.with_chance(parents)
             # what was grown from may have been no part of the matter
             lost = not going.explained or _least(found) > MUCH
             if lost and base.chi2_per_dof > GROSS and not (nowhere or places):
                 found += going.pairs(singles)
         level = best_by_name(found)
-        if size == 2 and going.seeking:
+        if size == 2 and going.seeking():
             level = [*going.of_more_modes(level), *level]
-    if going.seeking:
+    if going.seeking():
         going.each_alone(scores)
     going.contest()
     if going.one_more(depth):
@@ -185,7 +185,6 @@ class _Searching:
     done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
     found: set[tuple[str, ...]] = field(default_factory=set)  # alone, beside all other effects
 
-    @property
     def late(self) -> bool:
         """Whether no more than what has been found is to be looked at; asked before each step that
         seeks an explanation, which is left out then."""
@@ -193,10 +192,9 @@ class _Searching:
             self.left_out = True
         return self.left_out
 
-    @property
     def seeking(self) -> bool:
         """Whether nothing explains the data yet, and there is time to go on."""
-        return not (self.explained or self.late)
+        return not (self.explained or self.late())
 
     @property
     def apart(self) -> list[Effect]:
@@ -335,7 +333,7 @@ class _Searching:
         if best is None or best.spread is not None or len(best.effects) >= depth:
             return False
         found: list[Tried] = []
-        if best.fit_p < DOUBT and not self.late:
+        if best.fit_p < DOUBT and not self.late():
             beside = self._scattered(best.fit.structure, best.fit)
             beside += _simpler_beside_chance(beside, self.data, self.apart, self.run)
             self._add_beside_chance(beside)
@@ -344,7 +342,7 @@ class _Searching:
             more = [e for e in self.apart if joins(e, best.effects)]
             scores = score_tests(best.fit.structure, self.data, best.fit, more, self.run)
             lacking = best.fit_p < DOUBT or family_p(list(scores.values())) < MISSING
-            if lacking and not self.late:
+            if lacking and not self.late():
                 found += self.grown([best])
         return any(t.explains and best.parts < t.parts for t in found)
 
@@ -363,7 +361,7 @@ class _Searching:
 
     def _in_other_forms(self, found: Sequence[Tried]) -> list[Tried]:
         """Other forms of the best of `found`, if nothing explains the data."""
-        if self.by_chance or any(t.explains for t in found) or self.late:
+        if self.by_chance or any(t.explains for t in found) or self.late():
             return []
         self.report(0.6, "trying other forms of the best")
         others = reformed(found, self.data, self.forms, self.run, self.done)
@@ -399,7 +397,7 @@ class _Searching:
         ):
             for share in shares:
                 # a spread always comes near
-                if self.seeking and _least(self.laws) > LITTLE:
+                if self.seeking() and _least(self.laws) > LITTLE:
                     self.report(0.6, f"looking at the data to within {share:.1%}")
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
@@ -478,7 +476,7 @@ class _Searching:
         """What might do as well as the best is tried before it is claimed, and, where nothing can
         be, the foremost of what does not explain the data in other forms."""
         for seek in (reformed, varied):
-            if self.seeking:
+            if self.seeking():
                 self.tried += seek(self.laws, self.data, self.forms, self.run, self.done)
         self._contest()
         first = foremost([t for t in self.laws if t.plausible])
