@@ -36,7 +36,8 @@ EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very st
 LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 LOST = 1e6  # times its value: a standard error that says nothing of it
-WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it
+WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it …
+WORSE_P = 0.05  # … and any worse, where noise leaves as much as that by so small a chance
 ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 USUAL = 3.0  # what a form must gain on one of the same effect that stands before it: more usual
@@ -375,10 +376,10 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
 
 
 def _predicts_worse(t: Tried, o: Tried) -> bool:
-    """Whether `t` predicts the held-out runs worse than `o`: much, or a little and not by chance
-    either. Near the noise a few runs decide nothing."""
+    """Whether `t` predicts the held-out runs worse than `o`: much, or a little and hardly by chance
+    either. Near the noise a few runs decide nothing (44014)."""
     more = t.validation_error / o.validation_error
-    return more > WORSE or (more > 1.0 and t.validation_p < o.validation_p)
+    return more > WORSE or (more > 1.0 and t.validation_p < min(WORSE_P, o.validation_p))
 
 
 def foretold(t: Tried, error: float) -> bool:
