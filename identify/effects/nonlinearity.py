@@ -159,10 +159,13 @@ class DeadZone(Effect):
     """Nothing passes within ±`width`; beyond it, what exceeds it does."""
 
     name, location, form = "nonlinearity_shape", "nonlinearity", "dead_zone"
-    parameters = (Parameter("nonlinearity_shape.width", "m", 0.0, np.inf, "positive"),)
+    parameters = (Parameter("nonlinearity_shape.width", "m", 0.0, np.inf, "even", 1e-3),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(q * known.flame_input_amplitude,) for q in (0.005, 0.03, 0.15)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
 
     def operator(self, p: Values) -> Operator:
         width = p["nonlinearity_shape.width"]
@@ -206,10 +209,13 @@ class Hysteresis(Effect):
     """
 
     name, location, form = "nonlinearity_shape", "nonlinearity", "hysteresis"
-    parameters = (Parameter("nonlinearity_shape.width", "m", 0.0, np.inf, "positive"),)
+    parameters = (Parameter("nonlinearity_shape.width", "m", 0.0, np.inf, "even", 1e-3),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(q * known.flame_input_amplitude,) for q in (0.002, 0.02, 0.1)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
 
     def operator(self, p: Values) -> Operator:
         width = p["nonlinearity_shape.width"]
