@@ -44,6 +44,7 @@ from tests.trace_material import (
     altered_campaign,
     drawn_values,
     fitted,
+    of_runs,
     only,
     record,
     search_for,
@@ -265,7 +266,8 @@ def spread_of(evidence: float, objection: str) -> trace.Tried:
     fit = fitted(0, 0.0)
     (drive,) = [s for s in SCATTERS if s.name == "drive_scatter"]
     sizes = 2 * float(np.log(fit.residual.size))
-    spread = Spread(fit, None, dict.fromkeys("ab"), evidence - sizes, objection)  # type: ignore[arg-type]
+    none = dict.fromkeys("ab")
+    spread = Spread(fit, of_runs(15), none, evidence - sizes, objection)  # type: ignore[arg-type]
     return trace.Tried((drive,), fit, 1e-3, 0.5, 0.5, spread)
 
 

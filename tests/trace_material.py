@@ -3,6 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -121,6 +123,12 @@ def fitted(parameters: int, chi2_per_dof: float) -> Fit:
     none, rest = np.zeros((p, p)), np.zeros(119)
     chi2 = dof * chi2_per_dof
     return Fit(Structure(2), np.zeros(p), chi2, dof, none, rest, none, True, "", 1)
+
+
+def of_runs(runs: int) -> Any:
+    """Data of which only the number of forced runs is looked at, fitted and held out alike."""
+    batch = SimpleNamespace(runs=runs, free=False)
+    return SimpleNamespace(fit=(batch,), validation=(batch,))
 
 
 def tried_as(fit: Fit, *keys: str) -> trace.Tried:

@@ -73,6 +73,7 @@ FOREMOST, FORMS = 2, 4  # laws seen there beside which chance is tried, and form
 ALIKE = 1.05  # … that leave no more than so many times the least
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that a law leaves, or pairs, beyond which they are not near the data
+PLAINLY = 0.3  # of the declared misfit: what an effect of one number leaves that is grown from too
 NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
@@ -147,6 +148,8 @@ def search(
         found = going.pairs(singles) if nowhere else []
         if not going.explained or not nowhere:
             found = going.grown(parents, found)
+        if size == 2 and going.seeking():
+            found = going.grown(_plainest(singles, going), found)
         if size == 2 and not going.late():
             going.with_chance(parents)
             # what was grown from may have been no part of the matter
@@ -574,6 +577,17 @@ def _a_place_to_grow_from(singles: Sequence[Tried], base: Fit) -> bool:
         return False
     others = min([*best[1:], np.inf])
     return best[0] <= GROSS or STANDS_OUT * best[0] < max(others, base.chi2_per_dof / STANDS_OUT)
+
+
+def _plainest(singles: Sequence[Tried], going: _Searching) -> list[Tried]:
+    """The best of the effects of one number, where it takes away most of the misfit and has not
+    been grown from: those of several follow whatever else there is, and leave less (45205, a delay
+    of the speaker and a drift, behind three numbers of a nonlinear loss)."""
+    plain = [t for t in singles if len(t.effects[0].parameters) == 1 and t.plausible]
+    best = min(plain, key=_as_a_parent, default=None)
+    if best is None or best.key_of_forms in going.extended:
+        return []
+    return [best] if misfit(best) < PLAINLY * going.base.chi2 else []
 
 
 def _as_a_parent(t: Tried) -> float:

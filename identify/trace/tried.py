@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from scipy import stats
 
 from identify import assess
 from identify.chances import chi2_tail
@@ -352,6 +353,20 @@ def gain_p(gain: float, t: Tried, without: Fit) -> float:
     return min(1.0, chi2_tail(gain, freedom) * len(CATALOGUE))
 
 
+def _beside_chance_p(t: Tried, alone: Tried) -> float:
+    """The same of what a law gains beside a spread on that spread alone: its σ comes from a few
+    runs' deviations, N in all, which so many numbers may follow (45153). By F, which the likelihood
+    of a Gaussian of unknown variance has: gain = N ln(1 + k F/(N − k))."""
+    assert t.spread is not None
+    runs = sum(b.runs for b in t.spread.data.fit if not b.free)
+    count, freedom = runs * len(t.spread.sizes), max(t.fit.theta.size - alone.fit.theta.size, 1)
+    gain = alone.deviance - t.deviance
+    if gain <= 0 or count <= freedom:
+        return 1.0
+    ratio = float(np.expm1(min(gain / count, 500.0))) * (count - freedom) / freedom
+    return min(1.0, float(stats.f.sf(ratio, freedom, count - freedom)) * len(CATALOGUE))
+
+
 def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     """Whether the misfit that is left without one of the effects goes with it: more than chance
     takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
@@ -365,7 +380,7 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
     mostly = t.excess < without.excess / 3
     if t.spread is not None:
         alone = [o for o in tries if o.spread and o.within(t)]
-        found = all(gain_p(o.deviance - t.deviance, t, o.fit) < ALPHA for o in alone)
+        found = all(_beside_chance_p(t, o) < ALPHA for o in alone)
         least = min([without.evidence, *(o.evidence for o in alone)])
         hidden = t.validation_error > ASTRAY * declared.validation_error
         lost = len(t.effects) > 1 and hidden
