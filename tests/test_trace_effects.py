@@ -983,6 +983,14 @@ def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
     monkeypatch.setattr(trace.Tried, "plausible", True)
     going.with_chance([law])
     assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
+    # and beside a law that comes to light within it alone (46105)
+    asked.clear()
+    within = trace.Tried((*law.effects, DRIVE), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
+    monkeypatch.setattr(selection, "_beside_chance", lambda *rest: [within])
+    for simpler in ("_simpler_beside_chance", "_without_chance", "_without_law"):
+        monkeypatch.setattr(selection, simpler, lambda *rest: [])
+    going.with_chance([])
+    assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
 
 
 @pytest.mark.parametrize(("runs", "accounted"), [(9, False), (60, True)])

@@ -387,7 +387,10 @@ class _Searching:
             found += _simpler_beside_chance(found, data, self.apart, run)
             self._add_beside_chance(found)
         if not by_law:
-            self._add_beside_chance(_beside_chance(self.spreads_alone, data, self.apart, run))
+            found = _beside_chance(self.spreads_alone, data, self.apart, run)
+            other = [o for t in found if t.adequate for o in self._by_other_chance(t)]
+            other += _simpler_beside_chance(other, data, self.apart, run)
+            self._add_beside_chance([*found, *other])
 
         @cache
         def softened(share: float) -> tuple[Dataset, Fit]:
@@ -446,6 +449,12 @@ class _Searching:
         self.tried += [*found, *_without_chance(found, self.data)]
         known = {t.key_of_forms for t in self.tried if t.spread}
         self.tried += _without_law(found, known, self.data, self.run)
+
+    def _by_other_chance(self, t: Tried) -> list[Tried]:
+        """The law of `t` beside the other kinds of chance: it had been found within one that may
+        have done for another (46105, a damping that falls while frequencies wander)."""
+        kinds = [s for s in self.scatters if s.key != t.effects[-1].key]
+        return self._scattered(t.fit.structure, t.fit, kinds)
 
     @property
     def _others_by_chance(self) -> list[Scatter]:
