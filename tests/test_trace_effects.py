@@ -996,7 +996,7 @@ def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
 @pytest.mark.parametrize(("runs", "accounted"), [(9, False), (60, True)])
 def test_a_law_beside_few_runs_that_scatter_must_gain_more(runs: int, accounted: bool) -> None:
     """A mode of four numbers gained 30.6 of χ² and penalty on a scatter of nine runs, by following
-    it (45153). As many runs as that likelihood is for do not let it."""
+    it (45153). The same gain on sixty runs is none that chance brings about."""
     two = {"drive_scatter.gain_rms": None, "drive_scatter.phase_rms_rad": None}
     beside = Spread(fitted(15, 1.0), of_runs(runs), two, 200.0, "")  # type: ignore[arg-type]
     before = fitted(11, 1.0)
@@ -1021,13 +1021,13 @@ def test_the_plainest_law_is_grown_from_too() -> None:
     going = selection._Searching(
         Structure(2), none, fitted(11, 150.0), InProcess(), lambda *rest: None, (), (), ()
     )
-    singles = [replace(t, effects=t.effects) for t in (loss, delay, skew)]
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(trace.Tried, "plausible", True)
-        assert selection._plainest(singles, going) == [singles[1]]
-        assert selection._plainest([singles[0], singles[2]], going) == []  # leaves too much
+        (plainest,) = selection._plainest([loss, delay, skew], going)
+        assert plainest is delay
+        assert selection._plainest([loss, skew], going) == []  # leaves too much
         going.extended[delay.key_of_forms] = delay.fit.chi2
-        assert selection._plainest(singles, going) == []
+        assert selection._plainest([loss, delay, skew], going) == []
 
 
 def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:
