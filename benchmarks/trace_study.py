@@ -24,6 +24,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ Truth = dict[str, float]
 TURBULENCE = (-3.0, -1.3)  # decades of volts of drive
 TURBULENT = ("clean-turbulent", "effects-turbulent")
 UNSEEN = 1e-3  # chance of what an effect gains beside what was claimed, above which none sees it
+EXCESS = (1.5, 2.0, 3.0, 10.0, 100.0)  # steps of χ²/dof
 SIZES = (0.5, 0.2, 0.85)  # of `thesis`: in the range from barely visible to gross
 
 
@@ -328,6 +330,15 @@ def intervals(used: list[dict[str, Any]]) -> None:
                   f"above 1.5 in {sum(x > 1.5 for x in left)} of {len(left)}")  # fmt: skip
 
 
+def by_excess(used: list[dict[str, Any]]) -> None:
+    """Outcomes by how far the whitened residual of the declared model exceeds the noise."""
+    edges = (0.0, *EXCESS, np.inf)
+    print("χ²/dof of the declared model: outcomes")
+    for low, high in pairwise(edges):
+        row = Counter(outcome(r) for r in used if low <= r["chi2"][0] < high)
+        print(f"    {f'{low:g} to {high:g}':55s} {dict(row)}")
+
+
 def report(records: list[dict[str, Any]]) -> None:
     used = [r for r in records if "verdict" in r]
     print(f"{len(records)} campaigns: {len(used)} diagnosed, "
@@ -347,6 +358,7 @@ def report(records: list[dict[str, Any]]) -> None:
         table.setdefault(key, Counter())[outcome(r)] += 1
     for key, row in sorted(table.items()):
         print(f"    {key:55s} {dict(row)}")
+    by_excess(used)
     intervals(used)
     for r in used:
         if outcome(r) == "WRONG":

@@ -193,7 +193,9 @@ def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> N
     until(client, again["id"], ended)
     detail = client.get(f"/campaigns/{campaign}").json()
     assert detail["status"] == "complete"
-    assert len(detail["runs"]) == 3
+    # what the stop cut off, or lost frames on a busy machine, is kept beside them
+    good = [run["kind"] for run in detail["runs"] if run["exit_status"] == "success"]
+    assert good == ["free", "forced", "forced"]
     client.delete("/rigs/slow/lock", headers=mine)
 
 
