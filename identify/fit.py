@@ -26,7 +26,7 @@ from identify import balance
 from identify.balance import Orbits
 from identify.dataset import Batch, Dataset, whitener
 from identify.parameters import Estimate
-from identify.structure import Conditions, Structure
+from identify.structure import MODAL, Conditions, Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -42,6 +42,7 @@ STUCK = 8  # accepted steps of which nothing comes although the tangents promise
 FAR = 30.0  # … of so many times what noise leaves
 PROBE = 0.3  # of a step, where its curvature is looked at
 BENT = 0.4  # of the step that the bend may be
+SAME = 1.0  # of χ²: what two ends of descents differ by that are the same, modes renumbered or not
 
 
 @dataclass(frozen=True)
@@ -642,8 +643,48 @@ def fit_orbits(
     """Maximum-likelihood fit from one start (p,) or several (starts, p); the best one is returned.
 
     Each is led in by decreasing `continuation` shares, the last of which must be 0. It ends early
-    where its tangents promise no less than `hopeless` times what noise leaves.
+    where its tangents promise no less than `hopeless` times what noise leaves. Where it turns out
+    that another mode sings than the first, that one is called the first, if all is the same so.
     """
+    fit = _from_each(structure, data, thetas, continuation, iterations, hopeless)
+    other = _another_sings(fit)
+    if other is None:
+        return fit
+    enough = min(hopeless, (fit.chi2 + SAME) / data.residuals)
+    again = _from_each(structure, data, other, (0.0,), iterations, enough)
+    same = again.chi2 < fit.chi2 + SAME and again.converged >= fit.converged
+    return again if same else fit
+
+
+def _another_sings(fit: Fit) -> FloatArray | None:
+    """Unknowns with the modes renumbered, where the flame's part in mode 1 is within its error of
+    nothing and that in another is not. `Straightened` leads along the valley of mode 1: down that
+    of another, a descent creeps for thousands of steps. None where mode 1 sings, or none does.
+    """
+    names = fit.structure.parameters.names
+    if fit.structure.mode_count == 1 or not np.isfinite(fit.chi2):
+        return None
+    residues = [
+        names.index(f"mode{i}.flame_residue") for i in range(1, fit.structure.mode_count + 1)
+    ]
+    sizes = np.abs(fit.theta[residues]) / np.sqrt(np.diag(fit.covariance)[residues])
+    if not sizes[0] < 1 < sizes.max():
+        return None
+    theta = fit.theta.copy()
+    for kind in MODAL:
+        own, other = names.index(f"mode1.{kind}"), names.index(f"mode{sizes.argmax() + 1}.{kind}")
+        theta[own], theta[other] = fit.theta[other], fit.theta[own]
+    return theta
+
+
+def _from_each(
+    structure: Structure,
+    data: Dataset,
+    thetas: FloatArray,
+    continuation: Sequence[float],
+    iterations: int,
+    hopeless: float,
+) -> Fit:
     current = np.atleast_2d(thetas)
     batches = [b.balanced(structure) for b in data.fit]
     reason = "the harmonic balance has no solution at the start"
@@ -663,7 +704,10 @@ def fit_orbits(
         )
         if last:
             usable = [d for d in descents if d is not None]
-            best = min(usable, key=lambda d: (not d.converged, d.cost), default=None)
+            least = min((d.cost for d in usable), default=np.inf)
+            # one that has not converged yet, but is far below, shows that the others are astray
+            near = [d for d in usable if d.cost <= least + SAME]
+            best = min(near, key=lambda d: (not d.converged, d.cost), default=None)
         else:
             pairs = zip(current, descents, strict=True)
             current = np.stack([c if d is None else straight.outside(d.theta) for c, d in pairs])

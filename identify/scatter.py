@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize
+from scipy import optimize, stats
 
 from identify import assess
 from identify.chances import rank_correlation
@@ -41,7 +41,7 @@ LEAST_RUNS = 6  # forced runs below which a spread says nothing
 SQUARED = " squared"
 TREND_P = 0.003  # a rank correlation less probable than this is a law, not chance
 NOTHING = "no run deviates"  # an objection
-ONE_RUN = 0.9  # share of all deviation that a single run may hold
+ONE_RUN = 0.9  # share of all deviation that a single run may hold, whatever their number
 SMALLEST = 1e-8
 UNSEEN = 1e-13  # singular value, relative to the largest, of what the data say nothing of
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
@@ -346,8 +346,10 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> tu
     known, ranked, laws = _conditions(forced, scatter)
     doubts: list[tuple[float, str]] = []
     for name, own in zip(names, x[:, there].T, strict=True):
-        if np.max(own**2) > ONE_RUN * np.sum(own**2):
-            return f"{name}: a single run deviates", 0.0
+        share = float(np.max(own**2) / np.sum(own**2))
+        p_value = own.size * float(stats.beta.sf(share, 0.5, (own.size - 1) / 2))
+        if share > ONE_RUN and p_value < TREND_P:
+            doubts.append((p_value, f"{name}: a single run deviates (p {p_value:.1g})"))
         for word in ranked:
             # what the parameters could have absorbed and did not, seen in the deviations themselves
             if np.ptp(known[word]) > 0:

@@ -246,6 +246,11 @@ class Effect:
             row.append(known.pop(at)[1])
         return [tuple(row)]
 
+    def plainer(self, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """Other values of the whole model with which it responds nearly as with `values`, since
+        what this form has too much of cancels with what was declared: simpler forms start there."""
+        return []
+
     def apart_from(self, other: "Effect", values: Mapping[str, float]) -> list[tuple[float, ...]]:
         """Starting values of a form that refines another, from what that has come to, with which
         it responds otherwise: in a valley of its own, which no descent from `starts_from` finds."""

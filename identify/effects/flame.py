@@ -9,6 +9,8 @@ from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Values
 
+CANCELS = 0.2  # of a zero's frequency: so near to it a pole is as good as none
+
 
 class FlameDelay(Effect):
     """Convective time delay of the flame's response, e^{−sτ} (n–τ model)."""
@@ -36,6 +38,12 @@ class ExtraPole(Effect):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         period = 1 / known.free_hz
         return [(0.02 * period,), (0.1 * period,)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """What another lags behind, without its time scales."""
+        if isinstance(other, LaggingTimeScales):
+            return [(values["flame_dynamics.lag_s"],)]
+        return super().starts_from(other, values)
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,)
@@ -98,6 +106,23 @@ class LaggingTimeScales(Effect):
 
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         return self.scales.flame(p, at, s) / (s * p["flame_dynamics.lag_s"] + 1.0)
+
+    def plainer(self, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """The zero at (1 − share) T may stand on the declared pole a, which has then none of the
+        flame's size: r/(s + a) (1 + s/a)/(1 + sT) = (r/aT)/(s + 1/T), and the nonlinearity, behind
+        a pole that lets 1/(aT) times as much through, has c_d (aT)^(1 − d)."""
+        share, time = values["flame_dynamics.share"], values["flame_dynamics.time_s"]
+        pole = 2 * np.pi * values.get("flame.pole_hz", 0.0)
+        if not abs((1.0 - share) * time * pole - 1.0) < CANCELS:
+            return []
+        gain = 1.0 / (pole * time)
+        out = {**values, "flame.pole_hz": 1.0 / (2 * np.pi * time), "flame_dynamics.share": 0.0}
+        for name, value in values.items():
+            if name.endswith("flame_residue"):
+                out[name] = value * gain
+            elif name.startswith("nonlinearity.c"):
+                out[name] = value * gain ** (int(name.removeprefix("nonlinearity.c")) - 1)
+        return [out]
 
 
 class FlameResonance(Effect):

@@ -88,15 +88,15 @@ class AcousticMode(Effect):
         first = structure.mode_count + 1
         own = {}
         for i in range(self.more):
-            for q, kind in zip(self._of(i), _mode_parameters(""), strict=True):
+            for q, kind in zip(self.of(i), _mode_parameters(""), strict=True):
                 own[f"mode{first + i}.{kind.name.split('.')[1]}"] = values[q.name]
         return {**{q.name: values[q.name] for q in structure.base_parameters}, **own}
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
-        more = [Mode(*(p[q.name] for q in self._of(i))) for i in range(self.more)]
+        more = [Mode(*(p[q.name] for q in self.of(i))) for i in range(self.more)]
         return [*modes, *more]
 
-    def _of(self, i: int) -> tuple[Parameter, ...]:
+    def of(self, i: int) -> tuple[Parameter, ...]:
         """The four parameters of the further mode number `i`, from 0."""
         return self.parameters[4 * i : 4 * i + 4]
 
@@ -128,26 +128,29 @@ class _Resonator(Effect):
     def of_a_mode(
         self, other: Effect, values: Mapping[str, float]
     ) -> list[tuple[float, float, float, FloatArray]]:
-        """From one more mode: at its frequency the load takes the place of its residues, so that
-        r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise, with κ_i = κ_1 q_i taken for the
-        g_i h_i. Frequency, damping, κ_1 and q (count,); none from another effect."""
-        if not isinstance(other, AcousticMode) or other.more > 1:
+        """From one more mode, or any of several: at its frequency the load takes the place of its
+        residues, so that r_e = −ω² (Σ κ_i b_i) (Σ q_i b_i r_i), and a_e likewise, with
+        κ_i = κ_1 q_i taken for the g_i h_i. Frequency, damping, κ_1 and q (count,); none from
+        another effect."""
+        if not isinstance(other, AcousticMode):
             return []
-        f, zeta, r_e, a_e = (values[q.name] for q in other.parameters)
-        s = 2j * np.pi * f
-        modes = declared_modes(values, self.count)
-        b = np.array([complex(resonance(m, s)) for m in modes])
-        r = np.array([m.flame_residue for m in modes])
-        a = np.array([m.speaker_residue for m in modes])
-        part = (b * (a * r_e - r * a_e)).imag  # Σ q_i part_i = 0
-        q = np.ones(self.count)
-        if self.count > 1 and np.all(part[1:] != 0):
-            q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
-        size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
-        if not np.isfinite([f, zeta, size.real, *q]).all():
-            return []
-        # a strong one has moved the modes: from a tenth of the load they are brought there
-        return [(f, zeta, load, q) for load in (size.real, 0.1 * size.real)]
+        out = []
+        for i in range(other.more):
+            f, zeta, r_e, a_e = (values[q.name] for q in other.of(i))
+            s = 2j * np.pi * f
+            modes = declared_modes(values, self.count)
+            b = np.array([complex(resonance(m, s)) for m in modes])
+            r = np.array([m.flame_residue for m in modes])
+            a = np.array([m.speaker_residue for m in modes])
+            part = (b * (a * r_e - r * a_e)).imag  # Σ q_i part_i = 0
+            q = np.ones(self.count)
+            if self.count > 1 and np.all(part[1:] != 0):
+                q[1:] = np.clip(-part[0] / part[1:] / (self.count - 1), -20.0, 20.0)
+            size = -r_e / (abs(s) ** 2 * np.sum(q * b) * np.sum(q * b * r))
+            if np.isfinite([f, zeta, size.real, *q]).all():
+                # a strong one has moved the modes: from a tenth of the load they are brought there
+                out += [(f, zeta, load, q) for load in (size.real, 0.1 * size.real)]
+        return out
 
     def branch(self, p: Values, modes: list[Mode], s: Any) -> Branch:
         f, zeta = p["acoustic_mode.frequency_hz"], p["acoustic_mode.damping"]

@@ -258,7 +258,7 @@ def _in_form(item: _Exchange) -> Fit | None:
         others = beside(base.structure, base.theta, data, form, row)
         return np.concatenate([others, form.to_internal(row)])
 
-    known = [t.fit.values, *_named_otherwise(old, t)]
+    known = [t.fit.values, *_named_otherwise(old, t), *old.plainer(t.fit.values)]
     taken = [start(row, values) for values in known for row in form.starts_from(old, values)]
     if form.refines:
         alike = [matched(larger, row, t.fit, data) for row in taken]
