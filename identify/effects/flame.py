@@ -160,6 +160,16 @@ class DistributedDelay(Effect):
         period = 1 / known.free_hz
         return [(0.1 * period, 0.05 * period)]
 
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From a delay, spread little or much; from a lag, spread as widely as it is long."""
+        if isinstance(other, FlameDelay):
+            delay = max(values["flame_delay.delay_s"], 1e-6)
+            return [(delay, share * delay) for share in (0.1, 0.5, 1.0)]
+        if isinstance(other, ExtraPole):
+            lag = max(values["flame_dynamics.time_s"], 1e-6)
+            return [(lag, share * lag) for share in (0.5, 1.0)]
+        return super().starts_from(other, values)
+
     def flame(self, p: Values, at: Conditions, s: Any) -> Any:
         tau, sigma = p["flame_dynamics.delay_s"], p["flame_dynamics.spread_s"]
         ratio = tau / sigma

@@ -186,7 +186,7 @@ class _Searching:
     tried: list[Tried] = field(default_factory=list)
     extended: dict[tuple[str, ...], float] = field(default_factory=dict)  # grown from, χ² there …
     done: set[tuple[str, ...]] = field(default_factory=set)  # … and seen to in other forms
-    found: set[tuple[str, ...]] = field(default_factory=set)  # alone, beside all other effects
+    found: set[tuple[str, ...]] = field(default_factory=set)  # alone, and contested
 
     def late(self) -> bool:
         """Whether no more than what has been found is to be looked at; asked before each step that
@@ -255,11 +255,16 @@ class _Searching:
             self.tried += self._scattered(self.structure, base)
         return singles
 
-    def _left_alone(self) -> list[Tried]:
-        """The effects that explain the data alone and were not found so: what they stood beside was
-        not needed, or they were the only candidate. Nothing has contested them yet."""
+    def contest_alone(self) -> None:
+        """Other effects in the place of one that explains the data alone and was not found so: what
+        it stood beside was not needed, or it was the only candidate. Nothing has contested it."""
         singles = [t for t in self.laws if len(t.effects) == 1 and t.explains]
-        return singles if singles and best_form(singles).key_of_forms not in self.found else []
+        best = best_form(singles).key_of_forms if singles else None
+        if best is None or best in self.found:
+            return
+        self.found.add(best)
+        near = at_the_same_place(singles, self.data, self.available, self.run)
+        self.tried += [eliminate(t, self.data) if t.explains else t for t in near]
 
     def each_alone(self, scores: Mapping[str, ScoreTest] | None) -> None:
         """Each effect as if it were the only candidate, where nothing explains the data: of all
@@ -506,9 +511,10 @@ class _Searching:
         if any(t.explains for t in several):
             self.tried += in_other_forms(several, data, self.forms, run)
         near = at_the_same_place(several, data, self.available, run)
-        near += at_the_same_place(self._left_alone(), data, self.available, run)
         self.tried += [eliminate(t, data) if t.explains else t for t in near]
+        self.contest_alone()
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
+        self.contest_alone()
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
         self.tried += in_finer_forms(self.tried, data, self.forms, run)
         self.tried += settled(self.tried, data, run)

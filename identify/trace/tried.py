@@ -171,8 +171,11 @@ class Tried:
             q.name for q in own if q.kind == "positive" and known[q.name].stderr > values[q.name]
         }
         outside = (q.name for q in own if not (q.plausible(values[q.name]) or q.name in open_))
-        # without the flame's part in the mode that sings, nothing makes it sing
-        located = ["mode1.flame_residue", *(n for e in self.effects for n in e.located)]
+        # without the flame's part in the mode that sings, nothing makes it sing; where chance alone
+        # is gross, its noise hides that
+        alone = self.spread is not None and self.spread.unrivalled and len(self.effects) == 1
+        sings = [] if alone else ["mode1.flame_residue"]
+        located = [*sings, *(n for e in self.effects for n in e.located)]
         unseen = (n for n in located if not known[n].stderr <= abs(values[n]))
         dampings = (f"mode{i}.damping" for i in range(1, self.fit.structure.mode_count + 1))
         overdamped = (n for n in dampings if not values[n] < MODAL)
