@@ -42,6 +42,7 @@ STUCK = 8  # accepted steps of which nothing comes although the tangents promise
 FAR = 30.0  # … of so many times what noise leaves
 PROBE = 0.3  # of a step, where its curvature is looked at
 BENT = 0.4  # of the step that the bend may be
+FADES = 0.1  # of another's flame residue: less of it in mode 1 may be none
 SAME = 1.0  # of χ²: what two ends of descents differ by that are the same, modes renumbered or not
 
 
@@ -658,21 +659,24 @@ def fit_orbits(
 
 def _another_sings(fit: Fit) -> FloatArray | None:
     """Unknowns with the modes renumbered, where the flame's part in mode 1 is within its error of
-    nothing and that in another is not. `Straightened` leads along the valley of mode 1: down that
-    of another, a descent creeps for thousands of steps. None where mode 1 sings, or none does.
+    nothing, or fades on a way that has no end, and that in another is not. `Straightened` leads
+    along the valley of mode 1: down that of another, a descent creeps for thousands of steps. None
+    where mode 1 sings, or none does.
     """
     names = fit.structure.parameters.names
     if fit.structure.mode_count == 1 or not np.isfinite(fit.chi2):
         return None
-    residues = [
-        names.index(f"mode{i}.flame_residue") for i in range(1, fit.structure.mode_count + 1)
-    ]
-    sizes = np.abs(fit.theta[residues]) / np.sqrt(np.diag(fit.covariance)[residues])
-    if not sizes[0] < 1 < sizes.max():
+    modes = range(1, fit.structure.mode_count + 1)
+    at = [names.index(f"mode{i}.flame_residue") for i in modes]
+    parts = np.abs(fit.theta[at])
+    known = parts > np.sqrt(np.diag(fit.covariance)[at])
+    fades = not known[0] or (not fit.converged and parts[0] < FADES * parts.max())
+    if not fades or not known[1:].any():
         return None
+    sings = int(np.argmax(np.where(known[1:], parts[1:], 0.0))) + 2
     theta = fit.theta.copy()
     for kind in MODAL:
-        own, other = names.index(f"mode1.{kind}"), names.index(f"mode{sizes.argmax() + 1}.{kind}")
+        own, other = names.index(f"mode1.{kind}"), names.index(f"mode{sings}.{kind}")
         theta[own], theta[other] = fit.theta[other], fit.theta[own]
     return theta
 

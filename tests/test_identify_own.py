@@ -139,6 +139,19 @@ def test_a_spread_is_known_no_better_than_so_few_runs_tell(tmp_path: Path) -> No
         assert abs(np.log(known.value / size)) < 3 * error
 
 
+def test_that_one_run_of_few_deviates_may_be_luck(tmp_path: Path) -> None:
+    """Of eight runs one has nine tenths of all phase (53039): seldom, and no more."""
+    size = 0.00955810219346193
+    rig = random_rig(53039, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    scatter = make_effect("drive_scatter", {"gain_rms": size, "phase_rms_rad": size})
+    ready = record(tmp_path, 53039, rig, [scatter], forced=7, validation=2, cold=1, modes=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    spread = fit_scatter(ready.structure, ready.data, base, named("drive_scatter"))
+    assert spread is not None
+    assert "phase_rms_rad: a single run deviates (p" in spread.objection
+    assert 1e-4 < spread.luck < 3e-3
+
+
 @pytest.mark.parametrize(
     ("name", "size"),
     [

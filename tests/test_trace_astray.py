@@ -8,15 +8,17 @@ import pytest
 
 import identify
 from identify import start, trace
+from identify.dataset import Dataset
 from identify.effects import CANDIDATES, CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import fit_orbits
+from identify.fit import _another_sings, fit_orbits
 from identify.identification import prepare
 from identify.parameters import ParameterSet
 from identify.scatter import fit_scatter
-from identify.structure import Mode
+from identify.structure import MODAL, Mode, Structure
+from identify.trace import selection
 from identify.trace.contests import (
     at_the_same_place,
     in_each_form,
@@ -32,6 +34,7 @@ from identify.trace.tried import tried
 from simulated_rig.campaigns import RecordedRun
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
+from tests.test_identify_balance import forced_conditions
 from tests.trace_material import (
     altered_campaign,
     campaign,
@@ -320,6 +323,107 @@ def test_a_strong_side_resonator_of_a_tube_with_one_mode(tmp_path: Path) -> None
     assert found.explains
     frequency = found.estimates["acoustic_mode.frequency_hz"]
     assert abs(frequency.value - 268.0) < 4 * frequency.stderr
+
+
+def test_another_mode_sings_than_the_first(tmp_path: Path) -> None:
+    """A resonator splits the mode that sings: of the declared two, the second sings, and the
+    descent crept along the valley of the first for thousands of steps (53016)."""
+    size = {"frequency_hz": 143.05, "damping": 0.0204, "coupling": 0.0477}
+    rig = random_rig(53016, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    branch = make_effect("side_resonator", size)
+    ready = record(tmp_path, 53016, rig, [branch], forced=10, validation=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert base.converged
+    values = base.estimates
+    assert values["mode1.flame_residue"].stderr < 0.3 * values["mode1.flame_residue"].value
+    # named the other way round, it is renumbered where it has not come to its end
+    names = ready.structure.parameters.names
+    order = np.arange(len(names))
+    for kind in MODAL:
+        first, second = names.index(f"mode1.{kind}"), names.index(f"mode2.{kind}")
+        order[[first, second]] = second, first
+    other = replace(base, theta=base.theta[order], covariance=base.covariance[np.ix_(order, order)])
+    assert _another_sings(other) is None
+    assert _another_sings(replace(other, converged=False)) == pytest.approx(base.theta)
+    # without a mode that sings there is none to be called the first
+    silent = replace(base, covariance=base.covariance * 1e12)
+    assert _another_sings(silent) is None
+
+
+def test_either_of_two_further_modes_may_be_a_resonator() -> None:
+    """Two modes had taken up the phases that one lacks beside a resonator, and the form that is
+    the resonator itself had nothing to start from (53030)."""
+    two, alone = by_key("acoustic_mode:two_modes"), by_key("acoustic_mode:side_resonator_mode")
+    modal = ((153.5, 0.0065, 28.6, 17.7), (478.6, 0.16, -0.009, 0.45), (397.8, 0.016, 0.34, 0.22))
+    names = [f"mode1.{kind}" for kind in MODAL] + [q.name for q in two.parameters]
+    rows = alone.starts_from(two, dict(zip(names, sum(modal, ()), strict=True)))
+    assert [f for f, *_ in rows] == [478.6, 478.6, 397.8, 397.8]
+
+
+def test_a_flame_with_a_zero_on_its_pole_is_a_plainer_one() -> None:
+    """Its size is then known from nothing, though all else is (53002)."""
+    full = by_key("flame_dynamics:second_time_scale_pole")
+    plain = by_key("flame_dynamics:pole")
+    time, pole = 1.278e-4, 2 * np.pi * 220.0
+    values = {
+        "mode1.flame_residue": 114.0, "flame.pole_hz": 220.0, "nonlinearity.c2": 404.0,
+        "nonlinearity.c3": -4.35e7, "flame_dynamics.share": 1.0 - 1.0 / (time * pole),
+        "flame_dynamics.time_s": time, "flame_dynamics.lag_s": 2.12e-3,
+    }  # fmt: skip
+    (same,) = full.plainer(values)
+    s = 2j * np.pi * np.array([[50.0, 170.0, 1200.0]])
+    at = forced_conditions()
+    both = []
+    for p, effect in ((values, full), (same, plain)):
+        (lag,) = plain.starts_from(full, p)
+        own = {**p, "flame_dynamics.time_s": lag[0]} if effect is plain else p
+        path = effect.flame(own, at, s) / (s + 2 * np.pi * p["flame.pole_hz"])
+        # r h, r h c2 (h v)², r h c3 (h v)³: what the loop has of it
+        both.append([
+            p["mode1.flame_residue"] * path * path ** (n - 1) * c
+            for n, c in ((1, 1.0), (2, p["nonlinearity.c2"]), (3, p["nonlinearity.c3"]))
+        ])  # fmt: skip
+    assert np.allclose(both[0], both[1], rtol=1e-9)
+    assert full.plainer({**values, "flame_dynamics.share": 0.1}) == []
+
+
+def test_a_delay_leads_to_one_that_is_spread() -> None:
+    spread = by_key("flame_dynamics:distributed_delay")
+    rows = spread.starts_from(by_key("flame_delay"), {"flame_delay.delay_s": 2e-4})
+    assert {delay for delay, _ in rows} == {2e-4}
+    assert len({width for _, width in rows}) == 3
+    for delay, width in spread.starts_from(
+        by_key("flame_dynamics:pole"), {"flame_dynamics.time_s": 3e-4}
+    ):
+        assert delay == 3e-4
+        assert width <= delay
+
+
+def test_what_explains_alone_once_something_is_left_out_is_contested(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A delay that had stood beside another effect was claimed for a spread one that nobody had
+    asked beside it (45125); once is enough."""
+    delay, pole = tried_as(fitted(12, 1.0), "flame_delay"), by_key("flame_dynamics:pole")
+    asked: list[tuple[str, ...]] = []
+
+    def contested(tries: list[trace.Tried], *rest: object) -> list[trace.Tried]:
+        asked.extend(t.key_of_forms for t in tries)
+        return [tried_as(fitted(12, 1.0), pole.key)]
+
+    monkeypatch.setattr(selection, "at_the_same_place", contested)
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    going = selection._Searching(
+        Structure(2), Dataset((), (), 0.0), fitted(11, 30.0), InProcess(), lambda *rest: None,
+        (pole,), (), (),
+    )  # fmt: skip
+    going.contest_alone()
+    assert asked == []
+    going.tried = [delay]
+    going.contest_alone()
+    going.contest_alone()
+    assert asked == [("flame_delay",)]
+    assert [t.key_of_forms for t in going.tried] == [("flame_delay",), (pole.key,)]
 
 
 def test_a_resonator_beside_the_singing_mode_at_its_own_frequency(tmp_path: Path) -> None:
