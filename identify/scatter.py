@@ -155,6 +155,7 @@ def _alternate(
     sizes, settled = _guess(own), False
     if not len(starts):
         return None
+    begun = starts[0]
     for i in range(ROUNDS):
         enough = (FAR if i == 0 else HOPELESS) * data.residuals
         found = lead(structure, own, data.fit, starts, sizes, hopeless=10 * enough)
@@ -166,7 +167,8 @@ def _alternate(
         rows = [_rows(structure, led.theta, own.placed(b, led.own), scatter) for b in data.fit]
         if not _finite(rows):
             return None
-        starts = np.r_[led.theta, led.own][None]
+        # a guess that is far too wide leads astray: from the beginning too, once σ is known better
+        starts = np.stack([np.r_[led.theta, led.own], begun])
         before, sizes = sizes, _sizes(rows, sizes)
         settled = bool(np.allclose(sizes, before, rtol=0.01, atol=1e-6))
         if settled:

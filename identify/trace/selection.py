@@ -413,11 +413,24 @@ class _Searching:
                     soft, base = softened(share)
                     if np.isfinite(base.chi2):
                         seek(soft, base)
+        if self.seeking() and _least(self.laws) > NO_CHANCE:
+            self._likely_beside_chance(parents)
         if not self.accounted:
             found = _other_forms_beside_chance(self.tried, data, self.apart, run)
             self._add_beside_chance(found)
         if not self.accounted:
             self.tried += _in_the_place_of_chance(self.tried, data, self.apart, run)
+
+    def _likely_beside_chance(self, parents: Sequence[Tried]) -> None:
+        """Chance beside the best single laws whose values can be true, where no set of laws comes
+        near: what leaves less than they do may owe that to a mode that is overdamped (54019, a
+        delay of the flame while frequencies wander)."""
+        likely = [t for t in self.laws if len(t.effects) == 1 and t.plausible]
+        others = [t for t in best_by_name(likely) if all(t is not p for p in parents)]
+        for t in others[:FOREMOST]:
+            found = self._scattered(t.fit.structure, t.fit)
+            found += _simpler_beside_chance(found, self.data, self.apart, self.run)
+            self._add_beside_chance(found)
 
     def _chance_from_softened(self, soft: Dataset, base: Fit) -> None:
         """An effect and chance that are both gross lead each other astray. Where noise of some
@@ -460,6 +473,16 @@ class _Searching:
         have done for another (46105, a damping that falls while frequencies wander)."""
         kinds = [s for s in self.scatters if s.key != t.effects[-1].key]
         return self._scattered(t.fit.structure, t.fit, kinds)
+
+    def _beside_other_chance(self) -> list[Tried]:
+        """The same for the law that explains the data with a spread beside it: other kinds, tried
+        from where the law alone had been led to, may have gone astray (54158, frequencies that
+        wander beside a voice coil, claimed as a drive that scatters)."""
+        good = [t for t in against_chance(self.tried) if t.explains]
+        best = best_form(good) if good else None
+        if best is None or best.spread is None or len(best.effects) != 2:
+            return []
+        return self._by_other_chance(best)
 
     @property
     def _others_by_chance(self) -> list[Scatter]:
@@ -516,6 +539,7 @@ class _Searching:
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.contest_alone()
         self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
+        self.tried += self._beside_other_chance()
         self.tried += in_finer_forms(self.tried, data, self.forms, run)
         self.tried += settled(self.tried, data, run)
 
