@@ -9,6 +9,7 @@ import pytest
 from identify import assess, start
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS, DrivePhase, Scatter
+from identify.fit import fit_orbits
 from identify.own import Own, settle
 from identify.scatter import fit_scatter
 from identify.trace.stages import known_sizes
@@ -137,6 +138,29 @@ def test_a_spread_is_known_no_better_than_so_few_runs_tell(tmp_path: Path) -> No
         error = known.stderr / known.value
         assert 0.15 < error < 0.5  # of n deviations it is 1/√(2n)
         assert abs(np.log(known.value / size)) < 3 * error
+
+
+def test_a_spread_guessed_too_wide_leads_nothing_astray(tmp_path: Path) -> None:
+    """A hundred times too wide a guess let every run deviate until the mode that sings had no
+    damping left, and no descent came back from there (54158)."""
+    rig = random_rig(54158, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    effects = [
+        make_effect("parameter_drift/frequency_walk", {"frequency_walk": 1.4169e-4}),
+        make_effect("actuator_dynamics/voice_coil", {"pole_hz": 712.13}),
+    ]
+    ready = record(tmp_path, 54158, rig, effects, forced=10, validation=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    coil = by_key("actuator_dynamics:pole")
+    larger = ready.structure.with_effects(coil)
+    law = fit_orbits(larger, ready.data, np.r_[base.theta, coil.to_internal((2e-4,))])
+    spread = fit_scatter(larger, ready.data, law, named("parameter_drift"))
+    assert spread is not None
+    time = spread.fit.estimates["actuator_dynamics.time_s"]
+    assert abs(time.value - 1 / (2 * np.pi * 712.13)) < 4 * time.stderr
+    damping = spread.fit.estimates["mode1.damping"]
+    assert abs(damping.value - rig.plant.modes[0].damping) < 4 * damping.stderr
+    known = spread.sizes["parameter_drift.frequency_rms"]
+    assert abs(np.log(known.value / 1.4169e-4)) < 3 * known.stderr / known.value
 
 
 def test_that_one_run_of_few_deviates_may_be_luck(tmp_path: Path) -> None:

@@ -993,6 +993,60 @@ def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
     assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
 
 
+def test_a_law_beside_chance_is_claimed_only_after_the_other_kinds(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Frequencies that wander beside a voice coil were claimed as a drive that scatters: the other
+    kinds, started from the law alone, had gone astray (54158)."""
+    spread = Spread(fitted(0, 1.0), None, {}, 0.0, "")  # type: ignore[arg-type]
+    coil = tried_as(fitted(1, 1.0), "actuator_dynamics:pole")
+    best = trace.Tried((*coil.effects, DRIVE), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
+    asked: list[Any] = []
+
+    def scattered(*arguments: Any) -> list[trace.Tried]:
+        asked.append(arguments)
+        return []
+
+    monkeypatch.setattr(selection, "try_scatters", scattered)
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    none = Dataset((), (), 0.0)
+    going = selection._Searching(
+        Structure(2), none, fitted(0, 500.0), InProcess(), lambda *rest: None, (), (), SCATTERS
+    )
+    going.tried = [coil]
+    assert going._beside_other_chance() == []
+    assert asked == []
+    going.tried = [best]
+    going._beside_other_chance()
+    ((_, _, base, kinds, *_),) = asked
+    assert base is best.fit  # from where they ended together
+    assert {s.key for s in kinds} == {s.key for s in SCATTERS} - {"drive_scatter"}
+
+
+def test_chance_is_tried_beside_what_may_be_true(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A delay of the flame while frequencies wander left more than what an overdamped mode followed
+    (54019)."""
+    offset = tried_as(fitted(1, 2e4), "sensor_offset:propagation")
+    delay = tried_as(fitted(1, 8e4), "flame_delay")
+    pole = tried_as(fitted(1, 9e4), "flame_dynamics:pole")
+    shape = tried_as(fitted(1, 9.5e4), "nonlinearity_shape:quartic")
+    asked: list[Fit] = []
+    monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: t.names != offset.names))
+    none = Dataset((), (), 0.0)
+    going = selection._Searching(
+        Structure(2), none, fitted(0, 2e5), InProcess(), lambda *rest: None, (), (), SCATTERS
+    )
+    monkeypatch.setattr(
+        selection._Searching, "_scattered", lambda self, structure, base: asked.append(base) or []
+    )
+    going.tried = [offset, delay, pole, shape]
+    going._likely_beside_chance([offset])
+    assert [f.chi2 for f in asked] == [delay.fit.chi2, pole.fit.chi2]
+    asked.clear()
+    going._likely_beside_chance([delay])
+    assert [f.chi2 for f in asked] == [pole.fit.chi2, shape.fit.chi2]
+
+
 @pytest.mark.parametrize(("runs", "accounted"), [(9, False), (60, True)])
 def test_a_law_beside_few_runs_that_scatter_must_gain_more(runs: int, accounted: bool) -> None:
     """A mode of four numbers gained 30.6 of χ² and penalty on a scatter of nine runs, by following

@@ -356,6 +356,7 @@ def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     asked: list[str] = []
     nothing = replace(fitted(0, 0.0), chi2=np.inf)
     monkeypatch.setattr(selection, "fit_from_data", lambda structure, soft: nothing)
+    monkeypatch.setattr(selection._Searching, "_scattered", lambda *rest: [])
     monkeypatch.setattr(trace.Tried, "plausible", True)
     going = searching(fitted(0, 900.0), lambda share, text: asked.append(text))
     near = replace(beside(spread_of(900.0, ""), "flame_delay", 1e-9), fit=fitted(0, 6.0))
