@@ -1037,7 +1037,7 @@ def test_chance_is_tried_beside_what_may_be_true(monkeypatch: pytest.MonkeyPatch
         Structure(2), none, fitted(0, 2e5), InProcess(), lambda *rest: None, (), (), SCATTERS
     )
     monkeypatch.setattr(
-        selection._Searching, "_scattered", lambda self, structure, base: asked.append(base) or []
+        selection._Searching, "_scattered", lambda self, _, base, kinds: asked.append(base) or []
     )
     going.tried = [offset, delay, pole, shape]
     going._likely_beside_chance([offset])

@@ -134,14 +134,14 @@ class _Resonator(Effect):
         another effect."""
         if not isinstance(other, AcousticMode):
             return []
+        modes = declared_modes(values, self.count)
+        r = np.array([m.flame_residue for m in modes])
+        a = np.array([m.speaker_residue for m in modes])
         out = []
         for i in range(other.more):
             f, zeta, r_e, a_e = (values[q.name] for q in other.of(i))
             s = 2j * np.pi * f
-            modes = declared_modes(values, self.count)
             b = np.array([complex(resonance(m, s)) for m in modes])
-            r = np.array([m.flame_residue for m in modes])
-            a = np.array([m.speaker_residue for m in modes])
             part = (b * (a * r_e - r * a_e)).imag  # Σ q_i part_i = 0
             q = np.ones(self.count)
             if self.count > 1 and np.all(part[1:] != 0):

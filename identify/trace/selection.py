@@ -342,10 +342,7 @@ class _Searching:
             return False
         found: list[Tried] = []
         if best.fit_p < DOUBT and not self.late():
-            beside = self._scattered(best.fit.structure, best.fit)
-            beside += _simpler_beside_chance(beside, self.data, self.apart, self.run)
-            self._add_beside_chance(beside)
-            found += beside
+            found += self._beside_each_chance(best)
         if best.key_of_forms not in self.extended:
             more = [e for e in self.apart if joins(e, best.effects)]
             scores = score_tests(best.fit.structure, self.data, best.fit, more, self.run)
@@ -388,9 +385,7 @@ class _Searching:
                 continue  # no rival: what explains the data does so without it
             if by_law and parent.fit.chi2_per_dof > NO_CHANCE:
                 continue  # nor can what takes that much up be chance
-            found = self._scattered(parent.fit.structure, parent.fit, self._others_by_chance)
-            found += _simpler_beside_chance(found, data, self.apart, run)
-            self._add_beside_chance(found)
+            self._beside_each_chance(parent, self._others_by_chance)
         if not by_law:
             found = _beside_chance(self.spreads_alone, data, self.apart, run)
             other = [o for t in found if t.adequate for o in self._by_other_chance(t)]
@@ -421,6 +416,15 @@ class _Searching:
         if not self.accounted:
             self.tried += _in_the_place_of_chance(self.tried, data, self.apart, run)
 
+    def _beside_each_chance(
+        self, law: Tried, kinds: Sequence[Scatter] | None = None
+    ) -> list[Tried]:
+        """Run-to-run scatter, of some kinds or all, beside a law in its form and simpler ones."""
+        found = self._scattered(law.fit.structure, law.fit, kinds)
+        found += _simpler_beside_chance(found, self.data, self.apart, self.run)
+        self._add_beside_chance(found)
+        return found
+
     def _likely_beside_chance(self, parents: Sequence[Tried]) -> None:
         """Chance beside the best single laws whose values can be true, where no set of laws comes
         near: what leaves less than they do may owe that to a mode that is overdamped (54019, a
@@ -428,9 +432,7 @@ class _Searching:
         likely = [t for t in self.laws if len(t.effects) == 1 and t.plausible]
         others = [t for t in best_by_name(likely) if all(t is not p for p in parents)]
         for t in others[:FOREMOST]:
-            found = self._scattered(t.fit.structure, t.fit)
-            found += _simpler_beside_chance(found, self.data, self.apart, self.run)
-            self._add_beside_chance(found)
+            self._beside_each_chance(t)
 
     def _chance_from_softened(self, soft: Dataset, base: Fit) -> None:
         """An effect and chance that are both gross lead each other astray. Where noise of some
