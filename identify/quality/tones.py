@@ -35,7 +35,8 @@ ALONE = 100.0  # power over noise of a line that is named though no other run ha
 PURE = 4.0  # power over that of the bins beside it, of a line; of one found alone twice that
 PURE_MEAN = 2.0  # the same on an average of runs, of a line where the mains have one
 PURE_KNOWN = 1.0  # where other runs have a line: what the chance PRESENT stands for
-PRESENT = 1e-3  # chance below which a known tone counts as present in a run
+PRESENT = 1e-3  # chance below which a known tone counts as present in a run …
+HUM_PRESENT = 0.03  # … and one at the mains' frequency, of which all runs together must be sure
 ALPHA = 1e-6  # chance of a tone among noise, all runs and bins considered
 STILL_BINS, STILL = 0.45, 1e-3  # deviation between runs, in bins or of the frequency, of a tone
 CREST_BINS = 0.01  # to which the parabola through a line's three bins places it
@@ -111,12 +112,14 @@ def tones(
     out: list[Tone] = []
     flags: list[QualityFlag] = []
 
-    def believed(where: Sequence[Lines], frequencies: Sequence[float]) -> None:
+    def believed(
+        where: Sequence[Lines], frequencies: Sequence[float], chance: float = PRESENT
+    ) -> None:
         for frequency in frequencies:
             if any(abs(tone.frequency_hz - frequency) < SAME_BINS * width for tone in out):
                 continue
             seen = seen_at(where, frequency)
-            present = present_in(seen)
+            present = present_in(seen, chance)
             tone = common(frequency, seen, present) if present else None
             if tone is not None:
                 out.append(tone)
@@ -138,7 +141,7 @@ def tones(
             for p in alone
         ]
     bare = [lines(v, free, combinations=False) for v in views]
-    believed(searched, hum(searched, found, width))
+    believed(searched, hum(searched, found, width), HUM_PRESENT)
     believed(searched, multiples(out))
     believed(bare, constant(bare, width))
     return (*out, *unseen(bare, out)), flags
@@ -182,7 +185,8 @@ def hum(searched: Sequence[Lines], found: Sequence[Peak], width_hz: float) -> li
     """The mains' frequencies, where most runs have a line too faint to be named in any of them."""
     out = []
     for mains in MAINS_HZ:
-        purity = [s.where.purity(s.bin) for s in present_in(seen_at(searched, mains))]
+        present = present_in(seen_at(searched, mains), HUM_PRESENT)
+        purity = [s.where.purity(s.bin) for s in present]
         alone = scattered(found, mains, width_hz) == 0
         if len(purity) > 1 and alone and float(np.mean(purity)) > PURE_MEAN:
             out.append(mains)
@@ -279,9 +283,9 @@ def seen_at(searched: Sequence[Lines], frequency_hz: float) -> list[Sighting]:
     return [s for s in seen if s.ratio >= 0]
 
 
-def present_in(seen: Sequence[Sighting]) -> list[Sighting]:
+def present_in(seen: Sequence[Sighting], chance: float = PRESENT) -> list[Sighting]:
     """The runs in which a tone is, if they are most of those that could show it; else none."""
-    present = [s for s in seen if s.chance < PRESENT and s.where.purity(s.bin) > PURE_KNOWN]
+    present = [s for s in seen if s.chance < chance and s.where.purity(s.bin) > PURE_KNOWN]
     return present if 2 * len(present) > len(seen) else []
 
 

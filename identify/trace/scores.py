@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from identify.chances import chi2_tail, chi2_tails
 from identify.dataset import Dataset
+from identify.effects.scatter import Scatter
 from identify.executor import Executor
 from identify.fit import Fit, OrbitResidual
 from identify.structure import Effect, Structure
@@ -58,6 +59,16 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     rho, J = outcome.residual[0], outcome.jacobian[0]
     tangent = J[:, fit.theta.size :]
     Q = _span(J[:, : fit.theta.size])
+    if "pressure" in effect.needs:
+        rest = tangent - Q @ (Q.T @ tangent)
+        noise = _of_noise(larger, data, np.r_[fit.theta, inner], tangent, Q)
+        if np.linalg.norm(rest) < ABOVE_NOISE * noise:
+            return None
+    return _along(rho, tangent, Q)
+
+
+def _along(rho: FloatArray, tangent: FloatArray, Q: FloatArray) -> ScoreTest | None:
+    """The residual along a tangent, beyond what `Q` spans; None where that is all of it."""
     rest = tangent - Q @ (Q.T @ tangent)
     norm = float(np.linalg.norm(tangent))
     if not norm > 0:
@@ -65,15 +76,29 @@ def score_test(structure: Structure, data: Dataset, fit: Fit, effect: Effect) ->
     share = float(np.linalg.norm(rest)) / norm
     if share < 1e-5:  # wholly absorbed: what is left of the tangent is rounding
         return None
-    if "pressure" in effect.needs:
-        noise = _of_noise(larger, data, np.r_[fit.theta, inner], tangent, Q)
-        if np.linalg.norm(rest) < ABOVE_NOISE * noise:
-            return None
     U, S, _ = np.linalg.svd(rest, full_matrices=False)
     basis = U[:, 1e-8 * S[0] < S]
     along = basis.T @ rho
     drop = float(along @ along)
     return ScoreTest(drop, share, chi2_tail(drop, basis.shape[1]), basis)
+
+
+def chance_test(
+    structure: Structure, data: Dataset, fit: Fit, scatter: Scatter
+) -> ScoreTest | None:
+    """The same for random differences from run to run: along what lets every run deviate freely in
+    the directions of `scatter`, of which the fit absorbs a few."""
+    larger, count = structure.with_effects(*scatter.directions), fit.theta.size
+    none = np.zeros(len(scatter.directions))
+    outcome = OrbitResidual(larger, data.fit)(np.r_[fit.theta, none][None], np.array([0]), True)
+    if outcome.jacobian is None or not outcome.exists[0]:
+        return None
+    rho, J = outcome.residual[0], outcome.jacobian[0]
+    run = np.concatenate([np.repeat(b.at.identity, 2 * b.compared) for b in data.fit])
+    each = run[:, None] == np.unique(run)
+    own = (J[:, count:, None] * each[:, None, :]).reshape(rho.size, -1)
+    size = np.linalg.norm(own, axis=0)
+    return _along(rho, own[:, size > 0] / size[size > 0], _span(J[:, :count]))
 
 
 def _of_noise(

@@ -36,7 +36,7 @@ from identify.trace.contests import (
 )
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
-from identify.trace.scores import ScoreTest, family_p, scan, score_tests, stepped
+from identify.trace.scores import ScoreTest, chance_test, family_p, scan, score_tests, stepped
 from identify.trace.stages import (
     as_declared,
     known_sizes,
@@ -341,8 +341,13 @@ class _Searching:
         if best is None or best.spread is not None or len(best.effects) >= depth:
             return False
         found: list[Tried] = []
-        if best.fit_p < DOUBT and not self.late():
-            found += self._beside_each_chance(best)
+        deviating = [
+            kind
+            for kind in self.scatters
+            if best.fit_p < DOUBT or self._deviates(best, kind) < MISSING
+        ]
+        if deviating and not self.late():
+            found += self._beside_each_chance(best, deviating)
         if best.key_of_forms not in self.extended:
             more = [e for e in self.apart if joins(e, best.effects)]
             scores = score_tests(best.fit.structure, self.data, best.fit, more, self.run)
@@ -350,6 +355,11 @@ class _Searching:
             if lacking and not self.late():
                 found += self.grown([best])
         return any(t.explains and best.parts < t.parts for t in found)
+
+    def _deviates(self, law: Tried, kind: Scatter) -> float:
+        """Chance that noise alone makes the runs deviate so from a law as from this kind of it."""
+        test = chance_test(law.fit.structure, self.data, law.fit, kind)
+        return 1.0 if test is None else test.p_value
 
     def of_more_modes(self, level: Sequence[Tried]) -> list[Tried]:
         """Several modes more, from the data alone, where they leave less than all of `level`: more
