@@ -34,6 +34,7 @@ from identify.trace.contests import (
     varied,
     with_fewer,
 )
+from identify.trace.foreseen import foreseen
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
 from identify.trace.scores import ScoreTest, chance_test, family_p, scan, score_tests, stepped
@@ -74,7 +75,6 @@ ALIKE = 1.05  # … that leave no more than so many times the least
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
 MUCH = 30.0  # χ²/dof that a law leaves, or pairs, beyond which they are not near the data
 PLAINLY = 0.3  # of the declared misfit: what an effect of one number leaves that is grown from too
-FORESEEN = 0.6  # of the least misfit of two effects: what promises less is grown from
 NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
@@ -163,7 +163,7 @@ def search(
     if going.seeking():
         going.each_alone(scores)
         if depth > 1 and going.seeking():
-            going.grown(going.foreseen())
+            going.foreseen()
     going.contest()
     if going.one_more(depth):
         going.contest()
@@ -335,22 +335,13 @@ class _Searching:
             self.tried.append(eliminate(t, self.data) if shorten else t)
         return [*grown, *afar]
 
-    def foreseen(self) -> list[Tried]:
-        """The singles that, by the score tests where they are, leave noise or far less than any
-        pair does beside one effect more, and have not been grown from. Two effects may each leave
-        more than what follows either a little (54169, a loss and a delay of the flame, behind a
-        dozen others)."""
-        alone = [t for t in self.laws if len(t.effects) == 1]
-        least = min((misfit(t) for t in self.laws if len(t.effects) <= 2), default=np.inf)
-        promised = []
-        for t in best_of_each_form([t for t in alone if t.plausible and t.fit.converged]):
-            if t.key_of_forms not in self.extended:
-                more = [e for e in self.apart if joins(e, t.effects)]
-                scores = score_tests(t.fit.structure, self.data, t.fit, more, self.run)
-                left = misfit(t) - max((s.drop for s in scores.values()), default=0.0)
-                if left < FORESEEN * least or lack_of_fit_p(left, t.fit.dof - 1) > ALPHA:
-                    promised.append((left, t))
-        return [t for _, t in sorted(promised, key=lambda item: item[0])[:FOREMOST]]
+    def foreseen(self) -> None:
+        """The pairs that promise most beside each effect alone."""
+        self.report(0.95, "fitting pairs that the score tests foresee")
+        alone = [t for t in self.laws if len(t.effects) == 1 and t.plausible and t.fit.converged]
+        known = {t.key_of_forms for t in self.laws if t.plausible}
+        singles = best_of_each_form(alone)
+        self.tried += foreseen(singles, self.data, self.apart, known, self.run)
 
     def one_more(self, depth: int) -> bool:
         """Whether a claim has lacked one effect more: any, beside what hardly leaves noise, or a
