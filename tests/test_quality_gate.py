@@ -404,6 +404,17 @@ def test_faint_hum_is_believed_where_another_tone_would_not_be(
     assert [round(t.frequency_hz) for t in found.tones] == ([frequency] if believed else [])
 
 
+@pytest.mark.parametrize(("frequency", "believed"), [(50.0, True), (57.3, False)])
+def test_hum_of_which_many_runs_are_sure_together(frequency: float, believed: bool) -> None:
+    """Of sixteen runs fewer than half have it beyond doubt (55088: one of 0.36 Pa, not named)."""
+    rng = np.random.default_rng(2)
+    forced = [(142.0 + 2.3 * k, 3.0) for k in range(15)]
+    runs = [run_of("free", None, 0.0, rng)]
+    runs += [run_of(f"{f:g}Hz", f, volts, rng) for f, volts in forced]
+    found = inspect(edited(Campaign("many", tuple(runs), Medium()), line(frequency, 0.16)))
+    assert [round(t.frequency_hz) for t in found.tones] == ([frequency] if believed else [])
+
+
 def test_a_tone_in_one_run_is_no_interference(clean: Campaign) -> None:
     found, flags, _ = judged(clean, line(433.3, 2.0))
     assert flags == {"foreign_tone": "noted"}

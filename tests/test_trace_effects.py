@@ -37,7 +37,7 @@ from identify.structure import Conditions, Structure
 from identify.trace import selection
 from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
 from identify.trace.places import deviating, remembering, shaped, whereabouts
-from identify.trace.scores import scan
+from identify.trace.scores import chance_test, scan
 from identify.trace.selection import (
     _other_forms_beside_chance,
     _without_law,
@@ -100,6 +100,26 @@ def test_a_spread_from_run_to_run_is_told_by_its_direction(
     if name == "drive_scatter":
         size = spread.sizes["drive_scatter.gain_rms"]
         assert abs(np.log(size.value / 0.004)) < 3 * size.stderr / size.value
+
+
+@pytest.mark.parametrize("scattered", [True, False])
+def test_chance_beside_a_law_that_leaves_little(tmp_path: Path, scattered: bool) -> None:
+    """That the flame's gain differs from run to run is told beside a delay of the flame by how the
+    runs deviate, where all residuals together need be no larger than noise (55030)."""
+    effects: dict[str, dict[str, float]] = {"flame_delay": {"delay_s": 4e-4}}
+    if scattered:
+        effects["flame_gain_modulation"] = {"modulation_rms": 0.004, "corner_hz": 0.5}
+    ready = thesis_campaign(tmp_path, 5, effects, noise_db=45.0)
+    law = only(ready, start.fit_from_data(ready.structure, ready.data), "flame_delay")
+    found = {s.name: chance_test(ready.structure.with_effects(*law.effects), ready.data, law.fit, s)
+             for s in SCATTERS}  # fmt: skip
+    p_values = {name: test.p_value for name, test in found.items() if test is not None}
+    assert set(p_values) == {s.name for s in SCATTERS}
+    if scattered:
+        assert p_values["flame_gain_modulation"] < 1e-6
+        assert min(p_values, key=lambda name: p_values[name]) == "flame_gain_modulation"
+    else:
+        assert min(p_values.values()) > 1e-3
 
 
 def test_what_follows_the_drive_is_no_chance(tmp_path: Path) -> None:

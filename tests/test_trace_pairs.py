@@ -12,11 +12,12 @@ from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
 from identify.trace.contests import NEAR, varied, with_fewer
+from identify.trace.foreseen import foreseen
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place
 from identify.trace.stages import renamed
 from identify.trace.tried import tried
-from tests.trace_material import fitted, search_for, thesis_campaign, tried_as
+from tests.trace_material import fitted, only, search_for, thesis_campaign, tried_as
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -60,6 +61,28 @@ def test_where_no_single_effect_comes_near_pairs_are_sought_at_once(tmp_path: Pa
     assert rivals == []
     delay = best.estimates["flame_delay.delay_s"]
     assert abs(delay.value - DELAY_S) < 4 * delay.stderr
+
+
+def test_pairs_that_the_tangents_promise(tmp_path: Path) -> None:
+    """A loss and a microphone's lag: the one alone leaves far more than others do; the tangents
+    where it has ended tell that the other makes up for it (42077, 54169)."""
+    effects = {
+        "nonlinear_damping/cubic": {"cubic_s_per_m2": 10.0},
+        "channel_mismatch/lowpass": {"lowpass_hz": 4000.0},
+    }
+    ready = thesis_campaign(tmp_path, 4, effects)
+    base = start.fit_from_data(ready.structure, ready.data)
+    keys = ("nonlinear_damping:cubic_end", "flame_delay", "channel_mismatch:lowpass")
+    singles = [only(ready, base, key) for key in keys]
+    others = (*keys, "sensor_offset:modal_2", "nonlinearity_shape:quintic")
+    available, run = [by_key(k) for k in others], InProcess()
+    found = foreseen(singles, ready.data, available, (), run)
+    best = min(found, key=lambda t: t.fit.chi2)
+    assert set(best.key_of_forms) == {keys[0], keys[2]}
+    assert best.explains
+    assert not any(t.explains for t in singles)
+    done = {t.key_of_forms for t in found}
+    assert not done & {t.key_of_forms for t in foreseen(singles, ready.data, available, done, run)}
 
 
 @pytest.mark.slow

@@ -145,9 +145,11 @@ def search(
         parents = sorted(level, key=_as_a_parent)[:2]
         if size > 2:  # one of two effects may leave much; two of three hardly more than others do
             parents = [t for t in parents if misfit(t) <= BEHIND * misfit(parents[0])]
+        if size == 2:
+            going.foreseen()
         nowhere = size == 2 and not (places or _a_place_to_grow_from(singles, base))
-        found = going.pairs(singles) if nowhere else []
-        if not going.explained or not nowhere:
+        found = going.pairs(singles) if nowhere and not going.by_law else []
+        if not (going.by_law or (nowhere and going.explained)):
             found = going.grown(parents, found)
         if size == 2 and going.seeking():
             found = going.grown(_plainest(singles, going), found)
@@ -237,6 +239,11 @@ class _Searching:
     def by_chance(self) -> bool:
         """Whether a spread explains the data by itself: what else is in them is within it."""
         return any(t.explains for t in self.spreads_alone)
+
+    @property
+    def by_law(self) -> bool:
+        """Whether laws explain the data without chance."""
+        return any(t.explains for t in self.laws)
 
     @property
     def laws(self) -> list[Tried]:
