@@ -20,6 +20,7 @@ from threadpoolctl import threadpool_limits
 T = TypeVar("T")
 R = TypeVar("R")
 P = ParamSpec("P")
+Progress = Callable[[float, str], None]  # told the share done of a long work, and what is under way
 
 
 def one_thread(function: Callable[P, R]) -> Callable[P, R]:

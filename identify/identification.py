@@ -5,7 +5,6 @@ maximum likelihood on the solved orbit → errors, uncertainties, the model's ow
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +13,7 @@ import numpy.typing as npt
 from identify import assess, dataset, drive, harmonics, profile, quality, start
 from identify.dataset import Dataset
 from identify.declare import ModelError
-from identify.executor import InProcess
+from identify.executor import InProcess, Progress
 from identify.fit import Fit, failed
 from identify.harmonics import Harmonics
 from identify.record import Campaign, DeclaredModel
@@ -23,7 +22,6 @@ from identify.structure import Structure
 from identify.trace import astray, try_effects
 
 FloatArray = npt.NDArray[np.float64]
-Progress = Callable[[float, str], None]
 
 DOUBT = 10.0  # times its noise that a run flagged as down-weighted is taken to err
 

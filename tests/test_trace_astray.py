@@ -8,7 +8,6 @@ import pytest
 
 import identify
 from identify import start, trace
-from identify.dataset import Dataset
 from identify.effects import CANDIDATES, CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -17,7 +16,7 @@ from identify.fit import _another_sings, fit_orbits
 from identify.identification import prepare
 from identify.parameters import ParameterSet
 from identify.scatter import fit_scatter
-from identify.structure import MODAL, Mode, Structure
+from identify.structure import MODAL, Mode
 from identify.trace import selection
 from identify.trace.contests import (
     at_the_same_place,
@@ -42,6 +41,7 @@ from tests.trace_material import (
     only,
     record,
     recorded,
+    searching,
     thesis_campaign,
     tried_as,
 )
@@ -413,10 +413,7 @@ def test_what_explains_alone_once_something_is_left_out_is_contested(
 
     monkeypatch.setattr(selection, "at_the_same_place", contested)
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    going = selection._Searching(
-        Structure(2), Dataset((), (), 0.0), fitted(11, 30.0), InProcess(), lambda *rest: None,
-        (pole,), (), (),
-    )  # fmt: skip
+    going = searching(fitted(11, 30.0), available=[pole])
     going.contest_alone()
     assert asked == []
     going.tried = [delay]

@@ -11,7 +11,6 @@ import pytest
 import identify
 from identify import assess, balance, diagnosis, start, trace
 from identify.chances import chi2_tail
-from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -33,16 +32,13 @@ from identify.parameters import Estimate
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
-from identify.structure import Conditions, Structure
+from identify.structure import Conditions
 from identify.trace import selection
+from identify.trace.beside_chance import other_forms_beside_chance, without_law
 from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import chance_test, scan
-from identify.trace.selection import (
-    _other_forms_beside_chance,
-    _without_law,
-    against_chance,
-)
+from identify.trace.selection import against_chance
 from identify.trace.stages import by_name, known_sizes, try_scatters
 from identify.trace.tried import tried
 from simulated_rig import build_config
@@ -57,6 +53,7 @@ from tests.trace_material import (
     record,
     recorded,
     search_for,
+    searching,
     thesis_campaign,
     tried_as,
 )
@@ -993,12 +990,9 @@ def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
         return []
 
     monkeypatch.setattr(selection, "try_scatters", scattered)
-    for seek in ("_beside_chance", "_other_forms_beside_chance", "_in_the_place_of_chance"):
+    for seek in ("beside_chance", "other_forms_beside_chance", "in_the_place_of_chance"):
         monkeypatch.setattr(selection, seek, lambda *rest: [])
-    none = Dataset((), (), 0.0)
-    going = selection._Searching(
-        Structure(2), none, fitted(0, 500.0), InProcess(), lambda *rest: None, (), (), SCATTERS
-    )
+    going = searching(fitted(0, 500.0), scatters=SCATTERS)
     going.tried = [alone, law]
     monkeypatch.setattr(trace.Tried, "plausible", True)
     going.with_chance([law])
@@ -1006,8 +1000,8 @@ def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
     # and beside a law that comes to light within it alone (46105)
     asked.clear()
     within = trace.Tried((*law.effects, DRIVE), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
-    monkeypatch.setattr(selection, "_beside_chance", lambda *rest: [within])
-    for simpler in ("_simpler_beside_chance", "_without_chance", "_without_law"):
+    monkeypatch.setattr(selection, "beside_chance", lambda *rest: [within])
+    for simpler in ("simpler_beside_chance", "without_chance", "without_law"):
         monkeypatch.setattr(selection, simpler, lambda *rest: [])
     going.with_chance([])
     assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
@@ -1029,10 +1023,7 @@ def test_a_law_beside_chance_is_claimed_only_after_the_other_kinds(
 
     monkeypatch.setattr(selection, "try_scatters", scattered)
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    none = Dataset((), (), 0.0)
-    going = selection._Searching(
-        Structure(2), none, fitted(0, 500.0), InProcess(), lambda *rest: None, (), (), SCATTERS
-    )
+    going = searching(fitted(0, 500.0), scatters=SCATTERS)
     going.tried = [coil]
     assert going._beside_other_chance() == []
     assert asked == []
@@ -1052,10 +1043,7 @@ def test_chance_is_tried_beside_what_may_be_true(monkeypatch: pytest.MonkeyPatch
     shape = tried_as(fitted(1, 9.5e4), "nonlinearity_shape:quartic")
     asked: list[Fit] = []
     monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: t.names != offset.names))
-    none = Dataset((), (), 0.0)
-    going = selection._Searching(
-        Structure(2), none, fitted(0, 2e5), InProcess(), lambda *rest: None, (), (), SCATTERS
-    )
+    going = searching(fitted(0, 2e5), scatters=SCATTERS)
     monkeypatch.setattr(
         selection._Searching, "_scattered", lambda self, _, base, kinds: asked.append(base) or []
     )
@@ -1091,17 +1079,14 @@ def test_the_plainest_law_is_grown_from_too() -> None:
     loss = tried_as(fitted(14, 6.0), "nonlinear_damping:quadratic_end")
     delay = tried_as(fitted(12, 14.0), "actuator_dynamics:delay")
     skew = tried_as(fitted(12, 70.0), "channel_mismatch:skew")
-    none = Dataset((), (), 0.0)
-    going = selection._Searching(
-        Structure(2), none, fitted(11, 150.0), InProcess(), lambda *rest: None, (), (), ()
-    )
+    going = searching(fitted(11, 150.0))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(trace.Tried, "plausible", True)
-        (plainest,) = selection._plainest([loss, delay, skew], going)
+        (plainest,) = going.plainest([loss, delay, skew])
         assert plainest is delay
-        assert selection._plainest([loss, skew], going) == []  # leaves too much
+        assert going.plainest([loss, skew]) == []  # leaves too much
         going.extended[delay.key_of_forms] = delay.fit.chi2
-        assert selection._plainest([loss, delay, skew], going) == []
+        assert going.plainest([loss, delay, skew]) == []
 
 
 def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:
@@ -1114,12 +1099,12 @@ def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:
     begun = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0], iterations=5)
     both = try_scatters(larger, ready.data, begun, [DRIVE], InProcess())
     assert both[0].adequate
-    (alone,) = _without_law(both, (), ready.data, InProcess())
+    (alone,) = without_law(both, (), ready.data, InProcess())
     assert alone.explains
     assert alone.key_of_forms == ("drive_scatter",)
     declared, found = tried((), base, ready.data), [*both, alone]
     assert [trace.accounts(t, declared, found) for t in found] == [False, True]
-    assert _without_law(both, {("drive_scatter",)}, ready.data, InProcess()) == []
+    assert without_law(both, {("drive_scatter",)}, ready.data, InProcess()) == []
 
 
 def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
@@ -1135,7 +1120,7 @@ def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
     begun = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0])
     both = try_scatters(larger, ready.data, begun, [DRIVE], InProcess())
     assert not both[0].explains
-    found = _other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
+    found = other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
     best = trace.best_form([t for t in found if t.explains])
     assert best.key_of_forms == ("actuator_nonlinearity:cubic", "drive_scatter")
     a3 = best.estimates["actuator_nonlinearity.a3"]
@@ -1160,7 +1145,7 @@ def test_other_forms_are_asked_beside_each_kind_of_chance(tmp_path: Path) -> Non
     less = replace(scattered.fit, chi2=0.5 * walking.fit.chi2)
     refused = replace(walking.spread, objection="frequency_rms follows the frequency")
     both = [replace(scattered, fit=less), replace(walking, spread=refused)]
-    found = _other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
+    found = other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
     best = trace.best_form([t for t in found if t.explains])
     assert best.key_of_forms == ("actuator_dynamics:resonance", "parameter_drift:random")
 

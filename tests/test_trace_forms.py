@@ -17,7 +17,7 @@ from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import Fit, OrbitResidual, soften
+from identify.fit import OrbitResidual, soften
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
@@ -48,6 +48,7 @@ from tests.trace_material import (
     only,
     record,
     search_for,
+    searching,
     thesis_campaign,
     tried_as,
 )
@@ -342,12 +343,6 @@ def test_chance_does_for_a_law_of_the_same_name(monkeypatch: pytest.MonkeyPatch)
     assert trace.accounts(curve, declared, [curve, alone, ordered])
 
 
-def searching(base: Fit, report: Callable[[float, str], None]) -> selection._Searching:
-    """A search under way from there, on data of which nothing is looked at."""
-    none = Dataset((), (), 0.0)
-    return selection._Searching(base.structure, none, base, InProcess(), report, (), (), ())
-
-
 def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -560,7 +555,7 @@ def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_nea
 
     def left(chi2: float, *keys: str) -> trace.Tried:
         effects = tried_as(fitted(10 + len(keys), chi2), *keys)
-        return replace(effects, fit_p=0.0)
+        return replace(effects, fit_p=0.0, validation_p=0.0)
 
     drift = left(1.8, "parameter_drift:frequency")
     more = left(1.6, "parameter_drift:frequency", "acoustic_mode:mode")
@@ -577,6 +572,8 @@ def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_nea
     assert not claimed(drift, more, afar, pair)
     assert not claimed(drift, more, afar, shape=better)
     assert not claimed(drift, more, afar, floor=5e-4)
+    drift = replace(drift, validation_p=9e-4)  # a run far from the others, of unknown parameters
+    assert claimed(drift, more, afar, floor=5e-4)
     assert not claimed(left(1.8, "parameter_drift:frequency"), more, floor=float("nan"))
     spread = Spread(drift.fit, None, {}, 0.0, "")  # type: ignore[arg-type]
     walk = replace(drift, spread=spread)

@@ -10,13 +10,16 @@ import numpy as np
 
 from daq.importers import open_campaign
 from identify import start, trace
+from identify.dataset import Dataset
 from identify.effects import by_key
-from identify.executor import InProcess
+from identify.effects.scatter import Scatter
+from identify.executor import InProcess, Progress
 from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.record import Campaign
-from identify.structure import Structure
+from identify.structure import Effect, Structure
+from identify.trace import selection
 from simulated_rig import build_config
 from simulated_rig.campaigns import RecordedRun, simulate_campaign, write_campaign
 from simulated_rig.config import RigConfig
@@ -129,6 +132,19 @@ def of_runs(runs: int) -> Any:
     """Data of which only the number of forced runs is looked at, fitted and held out alike."""
     batch = SimpleNamespace(runs=runs, free=False)
     return SimpleNamespace(fit=(batch,), validation=(batch,))
+
+
+def searching(
+    base: Fit,
+    report: Progress = lambda share, text: None,
+    available: Sequence[Effect] = (),
+    scatters: Sequence[Scatter] = (),
+) -> selection._Searching:
+    """A search under way from there, on data of which nothing is looked at."""
+    none = Dataset((), (), 0.0)
+    return selection._Searching(
+        base.structure, none, base, InProcess(), report, tuple(available), (), tuple(scatters)
+    )
 
 
 def tried_as(fit: Fit, *keys: str) -> trace.Tried:

@@ -4,7 +4,7 @@ A search grows sets one effect at a time and drops what falls behind. Before one
 claimed, what might do as well from where it ended is tried.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 
 from identify import assess, dual
 from identify.dataset import Dataset
-from identify.executor import Executor
+from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
 from identify.structure import MODAL, Effect, Structure
@@ -43,7 +43,6 @@ from identify.trace.tried import (
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
-Progress = Callable[[float, str], None]
 #: A set of effects, those of them that are kept, the one that is not, what comes in its place.
 _Exchange = tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]
 

@@ -6,14 +6,14 @@ through coarse noise from the slow flow corrected for both of them; one more mod
 declared mode. What comes nearest is led on, and the best few are refitted.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 
 import numpy as np
 
 from identify.dataset import Dataset
-from identify.executor import Executor
+from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Effect, Known, Structure
@@ -87,7 +87,7 @@ def pairs_from_afar(
     available: Sequence[Effect],
     singles: Sequence[Tried],
     executor: Executor,
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> list[Tried]:
     """The pairs of effects that come nearest from the slow flow, refitted; `base` is the declared
     fit, which sizes of effects lean on."""

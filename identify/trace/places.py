@@ -8,13 +8,13 @@ the piece of its place speaks for that place: not every law is as smooth as the 
 piece explains the data, a memory is asked, and chance: runs that each deviate by themselves.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from identify.dataset import Dataset
 from identify.effects.shaped import CHANCES, PIECES, Setting, Shaped, ShapedMemory
-from identify.executor import Executor
+from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits, no_better
 from identify.results import Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
@@ -68,7 +68,7 @@ def shaped(
     base: Fit,
     tried: Sequence[Tried],
     executor: Executor,
-    progress: Callable[[float, str], None],
+    progress: Progress,
     shapes: Sequence[type[Shaped]] = PIECES,
 ) -> list[Tried]:
     """The pieces of each place, started from the declared fit and from what the best of `tried`
@@ -98,7 +98,7 @@ def remembering(
     data: Dataset,
     base: Fit,
     executor: Executor,
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> list[Tried]:
     """A memory, which takes longer: for where none of `shaped` explains the data. From the declared
     fit alone: what stands for a memory, no other place's law comes near."""
@@ -126,7 +126,7 @@ def within_a_place(
     pieces: Sequence[Tried],
     available: Sequence[Effect],
     executor: Executor,
-    progress: Callable[[float, str], None],
+    progress: Progress,
 ) -> list[Tried]:
     """One effect or two of the same place, where its freely shaped piece explains the data.
 

@@ -1,21 +1,30 @@
 """The search: singles, run-to-run scatter, pairs and triples, and what contests them."""
 
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 
 import numpy as np
-import numpy.typing as npt
 
 from identify.assess import lack_of_fit_p
 from identify.dataset import Dataset
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
-from identify.executor import Executor, InProcess
+from identify.executor import Executor, InProcess, Progress
 from identify.fit import Fit, fit_orbits, soften
 from identify.start import fit_from_data, other_minima
 from identify.structure import Effect, Structure
+from identify.trace.beside_chance import (
+    LITTLE,
+    beside_chance,
+    beside_the_same_chance,
+    in_the_place_of_chance,
+    other_forms_beside_chance,
+    simpler_beside_chance,
+    without_chance,
+    without_law,
+)
 from identify.trace.contests import (
     BEHIND,
     at_the_same_place,
@@ -26,7 +35,6 @@ from identify.trace.contests import (
     in_their_places,
     joins,
     led_on,
-    part_of,
     reformed,
     runners_up,
     settled,
@@ -37,10 +45,10 @@ from identify.trace.contests import (
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
-from identify.trace.scores import ScoreTest, chance_test, family_p, scan, score_tests, stepped
+from identify.trace.scores import ScoreTest, chance_test, family_p, score_tests
+from identify.trace.singles import Alone, by_itself, try_alone
 from identify.trace.stages import (
     as_declared,
-    known_sizes,
     started_again,
     try_effects,
     try_scatters,
@@ -57,17 +65,12 @@ from identify.trace.tried import (
     best_by_name,
     best_form,
     best_of_each_form,
-    first_of_each,
     foremost,
     foretold,
     misfit,
     tried,
 )
 
-FloatArray = npt.NDArray[np.float64]
-Progress = Callable[[float, str], None]
-
-BESIDE = 3  # effects that are tried beside a spread, of those that promise most
 #: Shares of each coefficient that count as noise, to see what is greatest: chance, or a law.
 CHANCE_SOFTENED, LAW_SOFTENED = (0.001, 0.005, 0.02), (0.005, 0.02)
 FOREMOST, FORMS = 2, 4  # laws seen there beside which chance is tried, and forms of each …
@@ -78,11 +81,9 @@ PLAINLY = 0.3  # of the declared misfit: what an effect of one number leaves tha
 NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
-MINIMA = 2  # of the declared model, beside the deepest, from which effects are sought …
-PROMISING = 2.0  # … that promise to leave no more there than so many times what the best leaves
-MISSING = 1e-6  # chance of the scores beside a claim below which it lacks an effect …
-DOUBT = 0.05  # … and of what a law leaves, below which it is asked what chance beside it does
-LITTLE = 5.0  # χ²/dof up to which a law of some parameters may follow chance, and hide it
+MINIMA = 2  # of the declared model, beside the deepest, from which effects are sought
+MISSING = 1e-6  # chance of the scores beside a law below which it lacks another, or chance …
+DOUBT = 0.05  # … and of what it leaves, below which either is tried whatever the scores
 
 
 class Cancelled(Exception):
@@ -152,7 +153,7 @@ def search(
         if not (going.by_law or (nowhere and going.explained)):
             found = going.grown(parents, found)
         if size == 2 and going.seeking():
-            found = going.grown(_plainest(singles, going), found)
+            found = going.grown(going.plainest(singles), found)
         if size == 2 and not going.late():
             going.with_chance(parents)
             # what was grown from may have been no part of the matter
@@ -256,8 +257,8 @@ class _Searching:
     def alone(self, scores: Mapping[str, ScoreTest] | None) -> list[Tried]:
         """Every effect by itself, and run-to-run scatter."""
         base = self.base
-        work = _Alone(self.structure, self.data, base, self.available, scores, self.minima)
-        singles = _alone(work, self.run, self.report)
+        work = Alone(self.structure, self.data, base, self.available, scores, self.minima)
+        singles = try_alone(work, self.run, self.report)
         self.tried += singles
         self.found |= {t.key_of_forms for t in singles if t.explains}
         if base.chi2_per_dof < LITTLE or not self.explained:
@@ -283,7 +284,7 @@ class _Searching:
         names = list(dict.fromkeys(e.name for e in self.available))
         names.sort(key=lambda name: name not in modes)  # which take longest: not to be waited for
         items = [
-            _Alone(
+            Alone(
                 self.structure,
                 self.data,
                 self.base,
@@ -293,7 +294,7 @@ class _Searching:
             )
             for name in names
         ]
-        for i, found in enumerate(self.run.map(_by_itself, items), start=1):
+        for i, found in enumerate(self.run.map(by_itself, items), start=1):
             self.tried += found
             self.report(0.9 + 0.05 * i / len(names), f"trying {names[i - 1]} by itself")
 
@@ -341,6 +342,16 @@ class _Searching:
             shorten = t.adequate or any(t is b for b in best)
             self.tried.append(eliminate(t, self.data) if shorten else t)
         return [*grown, *afar]
+
+    def plainest(self, singles: Sequence[Tried]) -> list[Tried]:
+        """The best of the effects of one number, where it takes away most of the misfit and has not
+        been grown from: those of several follow whatever else there is, and leave less (45205, a
+        delay of the speaker and a drift, behind three numbers of a nonlinear loss)."""
+        plain = [t for t in singles if len(t.effects[0].parameters) == 1 and t.plausible]
+        best = min(plain, key=_as_a_parent, default=None)
+        if best is None or best.key_of_forms in self.extended:
+            return []
+        return [best] if misfit(best) < PLAINLY * self.base.chi2 else []
 
     def foreseen(self) -> None:
         """The pairs that promise most beside each effect alone."""
@@ -415,9 +426,9 @@ class _Searching:
                 continue  # nor can what takes that much up be chance
             self._beside_each_chance(parent, self._others_by_chance)
         if not by_law:
-            found = _beside_chance(self.spreads_alone, data, self.apart, run)
+            found = beside_chance(self.spreads_alone, data, self.apart, run)
             other = [o for t in found if t.adequate for o in self._by_other_chance(t)]
-            other += _simpler_beside_chance(other, data, self.apart, run)
+            other += simpler_beside_chance(other, data, self.apart, run)
             self._add_beside_chance([*found, *other])
 
         @cache
@@ -439,17 +450,17 @@ class _Searching:
         if self.seeking() and _least(self.laws) > NO_CHANCE:
             self._likely_beside_chance(parents)
         if not self.accounted:
-            found = _other_forms_beside_chance(self.tried, data, self.apart, run)
+            found = other_forms_beside_chance(self.tried, data, self.apart, run)
             self._add_beside_chance(found)
         if not self.accounted:
-            self.tried += _in_the_place_of_chance(self.tried, data, self.apart, run)
+            self.tried += in_the_place_of_chance(self.tried, data, self.apart, run)
 
     def _beside_each_chance(
         self, law: Tried, kinds: Sequence[Scatter] | None = None
     ) -> list[Tried]:
         """Run-to-run scatter, of some kinds or all, beside a law in its form and simpler ones."""
         found = self._scattered(law.fit.structure, law.fit, kinds)
-        found += _simpler_beside_chance(found, self.data, self.apart, self.run)
+        found += simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
         return found
 
@@ -469,8 +480,8 @@ class _Searching:
         leads a fit without it astray however little it leaves then."""
         far = lack_of_fit_p(base.chi2, base.dof) < ALPHA
         spreads = try_scatters(self.structure, soft, base, self.scatters, self.run, far=far)
-        found = _beside_chance(spreads, self.data, self.apart, self.run)
-        found += _simpler_beside_chance(found, self.data, self.apart, self.run)
+        found = beside_chance(spreads, self.data, self.apart, self.run)
+        found += simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
 
     def _law_from_softened(self, soft: Dataset, base: Fit) -> None:
@@ -488,15 +499,15 @@ class _Searching:
             most = ALIKE * misfit(forms[0])
             for t in [t for t in forms if misfit(t) < most][:FORMS]:
                 found += self._scattered(t.fit.structure, t.fit)
-        found += _simpler_beside_chance(found, self.data, self.apart, self.run)
+        found += simpler_beside_chance(found, self.data, self.apart, self.run)
         self._add_beside_chance(found)
 
     def _add_beside_chance(self, found: Sequence[Tried]) -> None:
         """Sets with a spread, and what is left of those that come to the noise without it, and
         without the law: from where they ended, either may not be needed."""
-        self.tried += [*found, *_without_chance(found, self.data)]
+        self.tried += [*found, *without_chance(found, self.data)]
         known = {t.key_of_forms for t in self.tried if t.spread}
-        self.tried += _without_law(found, known, self.data, self.run)
+        self.tried += without_law(found, known, self.data, self.run)
 
     def _by_other_chance(self, t: Tried) -> list[Tried]:
         """The law of `t` beside the other kinds of chance: it had been found within one that may
@@ -568,74 +579,10 @@ class _Searching:
         self.contest_alone()
         self.tried += in_their_places(self.tried, data, self.apart, run, self.extended, self.report)
         self.contest_alone()
-        self.tried += _beside_the_same_chance(self.tried, data, self.apart, run, self.report)
+        self.tried += beside_the_same_chance(self.tried, data, self.apart, run, self.report)
         self.tried += self._beside_other_chance()
         self.tried += in_finer_forms(self.tried, data, self.forms, run)
         self.tried += settled(self.tried, data, run)
-
-
-@dataclass(frozen=True)
-class _Alone:
-    """What a worker needs to try effects one by one."""
-
-    structure: Structure
-    data: Dataset
-    base: Fit
-    available: tuple[Effect, ...]
-    scores: Mapping[str, ScoreTest] | None
-    minima: tuple[Fit, ...]  # others of the declared model
-
-
-def _alone(work: _Alone, run: Executor, report: Progress) -> list[Tried]:
-    """Every effect by itself; the best of them in their other forms too."""
-    data, base, available = work.data, work.base, work.available
-    far = astray(base)
-    apart = [e for e in available if not e.refines]
-    singles = try_effects(
-        work.structure, data, base, apart, executor=run, keep=8,
-        far=far, progress=lambda share, text: report(0.6 * share, text), scores=work.scores,
-    )  # fmt: skip
-    singles += _from_other_minima(work, apart, singles, run, report)
-    if far and not any(t.adequate for t in singles):
-        report(0.6, "starting the best once more from afar")
-        singles = started_again(singles, data, run)
-    richer = [e for e in available if e.refines and e.restated(work.structure) is not None]
-    if richer and not any(t.explains for t in singles):
-        found = try_effects(
-            work.structure, data, base, richer, executor=run, keep=1, far=False,
-            progress=lambda share, text: report(0.6, text),
-        )  # fmt: skip
-        # of so many parameters that, beside another effect, they would stand for it
-        singles += [t for t in found if t.explains]
-    singles += in_other_forms(singles, data, available, run)
-    singles += at_the_same_place(singles, data, available, run)
-    singles += led_on(singles, data, run)
-    return singles
-
-
-def _from_other_minima(
-    work: _Alone,
-    effects: Sequence[Effect],
-    singles: Sequence[Tried],
-    run: Executor,
-    report: Progress,
-) -> list[Tried]:
-    """Effects from other minima of the declared model, where one promises to leave no more there
-    than the best of `singles` does (40024: a gain that the fit of a mode gone astray hides)."""
-    out: list[Tried] = []
-    for base in work.minima:
-        scores = score_tests(work.structure, work.data, base, effects, run)
-        promised = base.chi2 - max((s.drop for s in scores.values()), default=0.0)
-        if promised < PROMISING * min((misfit(t) for t in (*singles, *out)), default=np.inf):
-            out += try_effects(
-                work.structure, work.data, base, effects, executor=run, keep=8, far=False,
-                progress=lambda share, text: report(0.6, text), scores=scores,
-            )  # fmt: skip
-    return out
-
-
-def _by_itself(work: _Alone) -> list[Tried]:
-    return _alone(work, InProcess(), lambda share, text: None)
 
 
 def _a_place_to_grow_from(singles: Sequence[Tried], base: Fit) -> bool:
@@ -646,17 +593,6 @@ def _a_place_to_grow_from(singles: Sequence[Tried], base: Fit) -> bool:
         return False
     others = min([*best[1:], np.inf])
     return best[0] <= GROSS or STANDS_OUT * best[0] < max(others, base.chi2_per_dof / STANDS_OUT)
-
-
-def _plainest(singles: Sequence[Tried], going: _Searching) -> list[Tried]:
-    """The best of the effects of one number, where it takes away most of the misfit and has not
-    been grown from: those of several follow whatever else there is, and leave less (45205, a delay
-    of the speaker and a drift, behind three numbers of a nonlinear loss)."""
-    plain = [t for t in singles if len(t.effects[0].parameters) == 1 and t.plausible]
-    best = min(plain, key=_as_a_parent, default=None)
-    if best is None or best.key_of_forms in going.extended:
-        return []
-    return [best] if misfit(best) < PLAINLY * going.base.chi2 else []
 
 
 def _as_a_parent(t: Tried) -> float:
@@ -707,180 +643,6 @@ def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
         else t
         for t in tries
     ]
-
-
-def _without_chance(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
-    """Effects beside a spread that comes to the noise, fitted from there without it.
-
-    A spread forgives the runs that had led the effect astray, and may have been needed for no more.
-    """
-    out = []
-    for t in tries:
-        if t.adequate:
-            # what it knows to within the noise, coarse noise would lose
-            fits = [
-                fit_orbits(t.fit.structure, data, t.fit.theta, continuation=steps)
-                for steps in ((0.003, 0.0), (0.0,))
-            ]
-            fit = min(fits, key=lambda f: f.chi2)
-            if np.isfinite(fit.chi2):
-                out.append(tried(t.fit.structure.effects, fit, data))
-    return out
-
-
-def _without_law(
-    tries: Sequence[Tried], known: Collection[tuple[str, ...]], data: Dataset, run: Executor
-) -> list[Tried]:
-    """Spreads alone, from where the first effect ended that comes to the noise beside each of them,
-    but for those `known`: from the declared fit they may have led nowhere."""
-    out: list[Tried] = []
-    for t in first_of_each([t for t in tries if t.adequate], lambda t: t.effects[-1].key).values():
-        chance = t.effects[-1]
-        assert isinstance(chance, Scatter)
-        if (chance.key,) not in known:
-            base = part_of(t, (), data)
-            out += try_scatters(base.structure, data, base, [chance], run)
-    return out
-
-
-def _simpler_beside_chance(
-    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
-) -> list[Tried]:
-    """The simpler forms of laws that come to the noise with a spread beside them: which form was
-    nearest without it, the scattered runs decided."""
-    out: list[Tried] = []
-    for t in tries:
-        if t.adequate:
-            most = {e.name: len(e.parameters) for e in t.effects}
-            forms = [e for e in available if len(e.parameters) < most.get(e.name, 0)]
-            out += _in_forms_beside_chance(t, data, forms, run)
-    return out
-
-
-def _other_forms_beside_chance(
-    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
-) -> list[Tried]:
-    """The other forms of the law that comes nearest to the noise beside each kind of chance, where
-    none explains the data: a spread that looks like no chance may follow what its form lacks. The
-    kind that takes up most leaves least whatever the law is: each is asked."""
-    near = [t for t in tries if t.spread and len(t.effects) == 2 and t.fit.chi2_per_dof < LITTLE]
-    near.sort(key=lambda t: (not t.adequate, misfit(t)))
-    out: list[Tried] = []
-    for t in first_of_each(near, lambda t: t.effects[-1].key).values():
-        found = _in_forms_beside_chance(t, data, available, run)
-        out += [*found, *_simpler_beside_chance(found, data, available, run)]
-        if any(o.explains for o in out):
-            break
-    return out
-
-
-def _in_forms_beside_chance(
-    t: Tried, data: Dataset, forms: Sequence[Effect], run: Executor
-) -> list[Tried]:
-    """Some other forms of the laws of `t`, beside the same spread."""
-    chance = t.effects[-1]
-    assert isinstance(chance, Scatter)
-    assert t.spread is not None
-    wide = t.spread.data
-    law = tried(t.fit.structure.effects, t.fit, wide)
-    others = in_each_form(law, wide, forms, run)
-    near = [o for o in others if o.adequate or misfit(o) < misfit(law)]
-    out: list[Tried] = []
-    for o in near:
-        out += try_scatters(o.fit.structure, data, o.fit, [chance], run)
-    return out
-
-
-def _beside_chance(
-    spreads: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
-) -> list[Tried]:
-    """Effects beside each of `spreads`, which explain nothing alone: those that promise most by
-    their tangents where the spread's own fit is. What changes at random drowns them elsewhere."""
-    out: list[Tried] = []
-    for t in spreads:
-        chance = t.effects[0]
-        assert isinstance(chance, Scatter)
-        assert t.spread is not None
-        base, wide = t.fit, t.spread.data
-        for e, none in _promising_most(base, wide, available, run):
-            thetas = stepped(base.structure, wide, base, e, [none])
-            if thetas:
-                larger = base.structure.with_effects(e)
-                fit = fit_orbits(larger, wide, thetas[0], continuation=(0.0,))
-                out += try_scatters(larger, data, fit, [chance], run)
-    return out
-
-
-def _promising_most(
-    base: Fit, data: Dataset, available: Sequence[Effect], run: Executor
-) -> list[tuple[Effect, FloatArray]]:
-    """The effects whose tangents take most off the misfit of `base`, each in its best form, and of
-    those whose shape is unknown the best one; with internal values at which they vanish."""
-    scores = score_tests(base.structure, data, base, available, run)
-    ranked = sorted((e for e in available if e.key in scores), key=lambda e: -scores[e.key].drop)
-    best = list(first_of_each(ranked, lambda e: e.name).values())[:BESIDE]
-    out = [(e, e.to_internal(none)) for e in best if (none := e.neutral()) is not None]
-    known = known_sizes(data, base)
-    scanned = [
-        (drop, e, none)
-        for e in available
-        if e.key not in scores and (shapes := e.shapes(known))
-        for drop, none, _ in scan(base.structure, data, base, e, shapes)[:1]
-    ]
-    scanned.sort(key=lambda item: -item[0])
-    return [*out, *((e, none) for _, e, none in scanned[:1])]
-
-
-def _in_the_place_of_chance(
-    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
-) -> list[Tried]:
-    """What changes in the course of a campaign, in the place of what is no chance after all beside
-    a law that comes to the noise with it."""
-    out: list[Tried] = []
-    spreads = [t for t in tries if t.spread and t.adequate and not t.plausible]
-    for t in best_by_name([t for t in spreads if len(t.effects) == 2])[:BESIDE]:
-        structure = t.fit.structure
-        base = fit_orbits(structure, data, t.fit.theta, continuation=(0.0,), iterations=0)
-        courses = [e for e in available if e.location == "experiment" and e.name not in t.names]
-        if np.isfinite(base.chi2):
-            out += try_effects(
-                structure, data, base, courses, executor=run, keep=3, far=False,
-                progress=lambda done, text: None,
-            )  # fmt: skip
-    return out
-
-
-def _beside_the_same_chance(
-    tries: Sequence[Tried],
-    data: Dataset,
-    available: Sequence[Effect],
-    run: Executor,
-    report: Progress,
-) -> list[Tried]:
-    """Other effects in the place of the one that explains the data with a spread beside it.
-
-    Only the nearest had a spread tried beside them; which those are, the scattered runs decided.
-    """
-    good = [t for t in tries if t.explains]
-    best = best_form(good) if good else None
-    if best is None or best.spread is None or len(best.effects) != 2:
-        return []
-    law, chance = best.effects
-    assert isinstance(chance, Scatter)
-    wide = best.spread.data
-    base = with_fewer(best, (), wide)
-    if not np.isfinite(base.chi2):
-        return []
-    others = [a for a in available if a.name != law.name]
-    found = try_effects(
-        base.structure, wide, base, others, executor=run, keep=5, far=False, rivals=True,
-        progress=lambda share, text: report(0.95 + 0.05 * share, text),
-    )  # fmt: skip
-    out: list[Tried] = []
-    for t in best_by_name(found):
-        if t.explains:
-            out += try_scatters(t.fit.structure, data, t.fit, [chance], run)
-    return [*out, *_without_chance(out, data)]
 
 
 def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:

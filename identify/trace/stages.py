@@ -7,7 +7,7 @@ fit far away. Where the tangent alone promises most of the misfit, the fit goes 
 beside a gross effect that is known exactly, coarse noise would lose what the base fit knows.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy.typing as npt
 from identify import assess
 from identify.dataset import Dataset
 from identify.effects.scatter import Scatter
-from identify.executor import Executor
+from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits, no_better
 from identify.scatter import Spread, fit_scatter
 from identify.start import (
@@ -319,7 +319,7 @@ def try_effects(
     executor: Executor,
     keep: int,
     far: bool,
-    progress: Callable[[float, str], None],
+    progress: Progress,
     scores: Mapping[str, ScoreTest] | None = None,
     rivals: bool = False,
 ) -> list[Tried]:
@@ -378,7 +378,7 @@ def _refits(
     data: Dataset,
     executor: Executor,
     keep: int,
-    progress: Callable[[float, str], None],
+    progress: Progress,
     each: bool = False,
 ) -> list[Tried]:
     """The staged starts led on, the best `keep` to the data's own noise, beside what came
