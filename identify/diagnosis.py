@@ -372,7 +372,8 @@ def _judge(
         words = near.words
         return "traced", near, (
             f"Adding {words} takes away all but a trace of the misfit and predicts the validation "
-            f"runs as well as noise permits, but for bad luck; χ²/dof {near.fit.chi2_per_dof:.2g} is left."
+            "runs as well as noise permits, but for bad luck; "
+            f"χ²/dof {near.fit.chi2_per_dof:.2g} is left."
         )  # fmt: skip
     chosen = trace.foremost(ranked)
     left = "" if chosen is None else (
