@@ -29,8 +29,8 @@ K = TypeVar("K", bound=Hashable)
 ALPHA = 1e-3  # false-alarm probability of each significance test
 GROSS = 300.0  # χ²/dof beyond which a fit is no place to start from alone
 MODAL = 0.7  # damping ratio up to which a mode is one
-OVERDAMPED = 0.15  # damping ratio of a mode that has strayed, where a misfit is left …
-VISIBLE = 10.0  # … of so much χ²/dof
+OVERDAMPED = 0.15  # damping ratio of a mode that has strayed: beside a spread, or where there is …
+VISIBLE = 10.0  # … a misfit of so much χ²/dof
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
 LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws leaves less by chance
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
@@ -177,8 +177,10 @@ class Tried:
         sings = [] if alone else ["mode1.flame_residue"]
         located = [*sings, *(n for e in self.effects for n in e.located)]
         unseen = (n for n in located if not known[n].stderr <= abs(values[n]))
+        # … which hides what has strayed as well
+        most = MODAL if self.spread is None else OVERDAMPED
         dampings = (f"mode{i}.damping" for i in range(1, self.fit.structure.mode_count + 1))
-        overdamped = (n for n in dampings if not values[n] < MODAL)
+        overdamped = (n for n in dampings if not values[n] < most)
         lost = (n for n in open_ if LOST * values[n] < known[n].stderr < np.inf)
         for names, what in (
             (outside, "at the edge of its range"),
