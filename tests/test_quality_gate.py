@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from identify.identification import prepare
-from identify.quality import Quality, inspect
+from identify.quality import Quality, inspect, tones
 from identify.record import Campaign, Medium, Run, Signal
 from tests import quality_material
 from tests.quality_material import (
@@ -413,6 +413,22 @@ def test_hum_of_which_many_runs_are_sure_together(frequency: float, believed: bo
     runs += [run_of(f"{f:g}Hz", f, volts, rng) for f, volts in forced]
     found = inspect(edited(Campaign("many", tuple(runs), Medium()), line(frequency, 0.16)))
     assert [round(t.frequency_hz) for t in found.tones] == ([frequency] if believed else [])
+
+
+@pytest.mark.parametrize(
+    ("at_bins", "amplitude", "believed"),
+    [
+        ((0.3, -0.3, 0.1, -0.2), (1.0, 2.4, 0.7, 1.9), False),  # a resonance in noise
+        ((0.01, 0.0, 0.02, 0.01), (1.0, 2.4, 0.7, 1.9), True),  # a tone more or less near
+        ((0.3, -0.3, 0.1, -0.2), (1.0, 1.1, 0.9, 1.0), True),  # a fan
+        ((0.3, -0.3), (1.0, 2.4), True),  # two runs say nothing
+    ],
+)
+def test_what_is_shaken_by_noise_is_no_tone(
+    at_bins: tuple[float, ...], amplitude: tuple[float, ...], believed: bool
+) -> None:
+    """A lightly damped mode stood within a bin of one place in most of thirteen runs (56426)."""
+    assert tones.shaken(np.array(at_bins), np.array(amplitude)) is not believed
 
 
 def test_a_tone_in_one_run_is_no_interference(clean: Campaign) -> None:

@@ -2,7 +2,8 @@
 
 A line is interference when it stands at the same frequency, to within a bin, in more than half of
 the runs where it could be seen. A rig's own narrow resonance, shaken by turbulence, peaks
-elsewhere in every run: where such scattered peaks surround it, a line is not believed.
+elsewhere, and more or less, in every run: where such scattered peaks surround it, or it does so
+itself, a line is not believed.
 
 What the free cycle and the drive combine to moves with the drive, and a line among all that, where
 no single run could tell it apart, is foreign where runs at several forcings have it at one place.
@@ -39,6 +40,7 @@ PRESENT = 1e-3  # chance below which a known tone counts as present in a run …
 HUM_PRESENT = 0.03  # … and one at the mains' frequency, of which all runs together must be sure
 ALPHA = 1e-6  # chance of a tone among noise, all runs and bins considered
 STILL_BINS, STILL = 0.45, 1e-3  # deviation between runs, in bins or of the frequency, of a tone
+SHAKEN_BINS, SHAKEN = 0.2, 0.35  # the same of a resonance in noise, and its amplitude's, relative
 CREST_BINS = 0.01  # to which the parabola through a line's three bins places it
 SAME_BINS = 0.75  # peaks this near belong together
 AROUND_BINS = 15.0  # where scattered peaks betray a resonance
@@ -305,6 +307,8 @@ def common(
     if at.size > 1 and float(np.std(at, ddof=1)) > still:
         return None
     amplitude = np.array([velocity(s) for s in present])
+    if mains_order(frequency_hz, 0.0) is None and shaken(at / present[0].view.bin_hz, amplitude):
+        return None
     noise = amplitude / np.sqrt([max(s.ratio, 1.0) for s in present])
     # seen in one run, it may be another in the next one
     spread = _of_mean(amplitude, alone=float(amplitude[0]) / 2)
@@ -316,6 +320,16 @@ def common(
     names = tuple(s.view.name for s in present)
     amplitude_mean = float(np.mean(amplitude))
     return Tone(frequency_hz, placed, amplitude_mean, stderr, unit, names, p_value)
+
+
+def shaken(at_bins: FloatArray, amplitude: FloatArray) -> bool:
+    """Whether a line wanders, and is as high as chance has it, run by run, as a narrow resonance
+    in noise is (56426, a lightly damped mode taken for a tone in thirteen runs): a tone that does
+    either for a reason does not do both."""
+    if at_bins.size < LEAST_SEEN:
+        return False
+    varies = float(np.std(amplitude, ddof=1)) > SHAKEN * float(np.mean(amplitude))
+    return varies and float(np.std(at_bins, ddof=1)) > SHAKEN_BINS
 
 
 def _of_mean(values: FloatArray, alone: float) -> float:
