@@ -15,7 +15,7 @@ from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
 from identify.structure import Effect
 from identify.trace.contests import in_each_form, part_of, with_fewer
-from identify.trace.scores import scan, score_tests, stepped
+from identify.trace.scores import most_promising, scan, score_tests, stepped
 from identify.trace.stages import known_sizes, try_effects, try_scatters
 from identify.trace.tried import Tried, best_by_name, best_form, first_of_each, misfit, tried
 
@@ -133,8 +133,7 @@ def _promising_most(
     """The effects whose tangents take most off the misfit of `base`, each in its best form, and of
     those whose shape is unknown the best one; with internal values at which they vanish."""
     scores = score_tests(base.structure, data, base, available, run)
-    ranked = sorted((e for e in available if e.key in scores), key=lambda e: -scores[e.key].drop)
-    best = list(first_of_each(ranked, lambda e: e.name).values())[:BESIDE]
+    best = most_promising(scores, available, BESIDE)
     out = [(e, e.to_internal(none)) for e in best if (none := e.neutral()) is not None]
     known = known_sizes(data, base)
     scanned = [

@@ -15,7 +15,7 @@ from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits
 from identify.structure import Effect
 from identify.trace.contests import joins
-from identify.trace.scores import score_tests, stepped
+from identify.trace.scores import most_promising, score_tests, stepped
 from identify.trace.stages import canonical
 from identify.trace.tried import Tried, few_of_each, key_of_forms, misfit, tried
 
@@ -50,8 +50,7 @@ def _promises(item: tuple[Tried, Dataset, Sequence[Effect]]) -> list[_Promise]:
     t, data, available = item
     beside = [e for e in available if joins(e, t.effects)]
     scores = score_tests(t.fit.structure, data, t.fit, beside, InProcess())
-    ranked = sorted((e for e in beside if e.key in scores), key=lambda e: -scores[e.key].drop)
-    best = few_of_each(ranked, lambda e: e.name, 1)[:BESIDE]
+    best = most_promising(scores, beside, BESIDE)
     return [(misfit(t) - scores[e.key].drop, e) for e in best]
 
 

@@ -7,7 +7,7 @@ To start from is a step of all unknowns together too: where the fit absorbs near
 the effect beside what had stood for it leaves far more than there was.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from identify.effects.scatter import Scatter
 from identify.executor import Executor
 from identify.fit import Fit, OrbitResidual
 from identify.structure import Effect, Structure
+from identify.trace.tried import first_of_each
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -201,6 +202,14 @@ def score_tests(
     """Score tests by the effects' keys, of those that have one."""
     found = executor.map(_score, [(structure, data, fit, e) for e in effects])
     return {e.key: s for e, s in zip(effects, found, strict=True) if s is not None}
+
+
+def most_promising(
+    scores: Mapping[str, ScoreTest], effects: Sequence[Effect], count: int
+) -> list[Effect]:
+    """The effects whose small sizes would take most off χ², each in its best form."""
+    ranked = sorted((e for e in effects if e.key in scores), key=lambda e: -scores[e.key].drop)
+    return list(first_of_each(ranked, lambda e: e.name).values())[:count]
 
 
 def _score(item: tuple[Structure, Dataset, Fit, Effect]) -> ScoreTest | None:

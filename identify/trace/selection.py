@@ -418,7 +418,7 @@ class _Searching:
         data, run = self.data, self.run
         self.report(0.6, "trying run-to-run scatter beside an effect")
         good = [t for t in self.tried if t.explains]
-        by_law = [t for t in good if t.spread is None]
+        by_law = self.by_law
         for parent in parents:
             if by_law and parent.names[0] not in best_form(good).names:
                 continue  # no rival: what explains the data does so without it
