@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import stats
 
 import identify
 from identify.chances import chi2_tail
@@ -52,6 +53,8 @@ TURBULENCE = (-3.0, -1.3)  # decades of volts of drive
 TURBULENT = ("clean-turbulent", "effects-turbulent")
 UNSEEN = 1e-3  # chance of what an effect gains beside what was claimed, above which none sees it
 EXCESS = (1.5, 2.0, 3.0, 10.0, 100.0)  # steps of χ²/dof
+CLEAR = 2.0  # χ²/dof above which the residual exceeds the noise clearly: by as much as noise is
+RIGHT = ("right", "right, the rest unseen")
 SIZES = (0.5, 0.2, 0.85)  # of `thesis`: in the range from barely visible to gross
 
 
@@ -270,7 +273,8 @@ def outcome(r: dict[str, Any]) -> str:
     if r["verdict"] == "ambiguous":
         # foreign tones are claimed beside whatever else is
         rest = [n for n in truth if n != "interference" or n not in claimed]
-        return "ambiguous" if rest in [sorted(b) for b in r["best"]] else "ambiguous, truth out"
+        among = rest in [sorted(set(b)) for b in r["best"]]  # one effect may come in two kinds
+        return "ambiguous" if among else "ambiguous, truth out"
     if r["verdict"] == "unexplained":
         if not r["mode"].startswith("leftout"):
             return "unexplained"
@@ -339,6 +343,25 @@ def by_excess(used: list[dict[str, Any]]) -> None:
         print(f"    {f'{low:g} to {high:g}':55s} {dict(row)}")
 
 
+def rates(used: list[dict[str, Any]]) -> None:
+    """Shares of right and wrong claims, with their 95 % intervals, of what there was to be seen."""
+    there = [r for r in used if r["truth"] and outcome(r) != "unseen"]
+    for what, those in (
+        ("seen at all", there),
+        (f"χ²/dof above {CLEAR:g}", [r for r in there if r["chi2"][0] > CLEAR]),
+    ):
+        if not those:
+            continue
+        print(f"of {len(those)} {what}:")
+        for word, n in (
+            ("right", sum(outcome(r) in RIGHT for r in those)),
+            ("wrong", sum(outcome(r) == "WRONG" for r in those)),
+        ):
+            low, high = stats.binomtest(n, len(those)).proportion_ci(method="wilson")
+            print(f"    {word:8s}{n} = {100 * n / len(those):.2f} % "
+                  f"({100 * low:.2f} to {100 * high:.2f})")  # fmt: skip
+
+
 def report(records: list[dict[str, Any]]) -> None:
     used = [r for r in records if "verdict" in r]
     print(f"{len(records)} campaigns: {len(used)} diagnosed, "
@@ -349,6 +372,7 @@ def report(records: list[dict[str, Any]]) -> None:
     print("outcomes:", dict(Counter(outcome(r) for r in used)))
     if not used:
         return
+    rates(used)
     print(f"CPU s a diagnosis: median {np.median([r['cpu_s'] for r in used]):.1f}, "
           f"largest {max(r['cpu_s'] for r in used):.1f}")  # fmt: skip
     print("effect (variant): outcomes")
