@@ -18,15 +18,9 @@ from identify.parameters import ParameterSet
 from identify.scatter import fit_scatter
 from identify.structure import MODAL, Mode
 from identify.trace import selection
-from identify.trace.contests import (
-    at_the_same_place,
-    in_each_form,
-    in_other_forms,
-    in_their_places,
-    joins,
-    matched,
-    reformed,
-)
+from identify.trace.contests import at_the_same_place, in_their_places, reformed
+from identify.trace.exchange import in_each_form, in_other_forms, joins
+from identify.trace.matched import matched
 from identify.trace.scores import scan, stepped
 from identify.trace.stages import known_sizes, slow_flow_starts
 from identify.trace.tried import tried

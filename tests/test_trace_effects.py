@@ -35,11 +35,13 @@ from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
 from identify.trace import selection
 from identify.trace.beside_chance import other_forms_beside_chance, without_law
-from identify.trace.contests import _named_otherwise, eliminate, in_other_forms, settled
+from identify.trace.exchange import in_other_forms
+from identify.trace.fewer import eliminate, named_otherwise
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import chance_test, scan
 from identify.trace.selection import against_chance
 from identify.trace.stages import by_name, known_sizes, try_scatters
+from identify.trace.to_the_end import settled
 from identify.trace.tried import tried
 from simulated_rig import build_config
 from simulated_rig.effects import make_effect
@@ -489,7 +491,7 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     assert mode.fit.values["acoustic_mode.frequency_hz"] < 225.0
     # a further mode goes by the smallest part in the response: the resonator may be a declared one
     structure = mode.fit.structure
-    (other,) = _named_otherwise(mode.effects[0], mode)
+    (other,) = named_otherwise(mode.effects[0], mode)
     assert other["mode2.frequency_hz"] == mode.fit.values["acoustic_mode.frequency_hz"]
     theta = structure.parameters.to_internal([other[n] for n in structure.parameters.names])
     same = fit_orbits(structure, ready.data, theta, continuation=(0.0,), iterations=0)

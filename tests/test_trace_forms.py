@@ -456,7 +456,7 @@ def test_what_is_far_less_likely_in_a_coarse_form_is_contested_in_a_finer_one(
         return []
 
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    monkeypatch.setattr(contests, "_refitted", refitted)
+    monkeypatch.setattr(contests, "refitted", refitted)
     skew = tried_as(fitted(1, 0.5), "channel_mismatch:skew")
     none = Dataset((), (), 0.0)
     for left, others in (

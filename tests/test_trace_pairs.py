@@ -11,7 +11,8 @@ from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
-from identify.trace.contests import NEAR, varied, with_fewer
+from identify.trace.contests import NEAR, varied
+from identify.trace.fewer import with_fewer
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place

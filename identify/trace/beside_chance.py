@@ -14,7 +14,8 @@ from identify.effects.scatter import Scatter
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
 from identify.structure import Effect
-from identify.trace.contests import in_each_form, part_of, with_fewer
+from identify.trace.exchange import in_each_form
+from identify.trace.fewer import part_of, with_fewer
 from identify.trace.scores import most_promising, scan, score_tests, stepped
 from identify.trace.stages import known_sizes, try_effects, try_scatters
 from identify.trace.tried import Tried, best_by_name, best_form, first_of_each, misfit, tried

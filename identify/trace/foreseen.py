@@ -14,7 +14,7 @@ from identify.dataset import Dataset
 from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits
 from identify.structure import Effect
-from identify.trace.contests import joins
+from identify.trace.exchange import joins
 from identify.trace.scores import most_promising, score_tests, stepped
 from identify.trace.stages import canonical
 from identify.trace.tried import Tried, few_of_each, key_of_forms, misfit, tried

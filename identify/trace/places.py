@@ -19,7 +19,8 @@ from identify.fit import Fit, fit_orbits, no_better
 from identify.results import Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
 from identify.structure import Effect, Structure
-from identify.trace.contests import joins, part_of
+from identify.trace.exchange import joins
+from identify.trace.fewer import part_of
 from identify.trace.stages import (
     ROUGH,
     known_sizes,

@@ -28,20 +28,14 @@ from identify.trace.beside_chance import (
 from identify.trace.contests import (
     BEHIND,
     at_the_same_place,
-    eliminate,
-    in_each_form,
     in_finer_forms,
-    in_other_forms,
     in_their_places,
-    joins,
-    led_on,
     reformed,
     runners_up,
-    settled,
-    suits,
     varied,
-    with_fewer,
 )
+from identify.trace.exchange import in_each_form, in_other_forms, joins, suits
+from identify.trace.fewer import eliminate, with_fewer
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
@@ -54,6 +48,7 @@ from identify.trace.stages import (
     try_scatters,
     usable,
 )
+from identify.trace.to_the_end import led_on, settled
 from identify.trace.tried import (
     ALPHA,
     BEATEN,

@@ -9,9 +9,11 @@ from identify.dataset import Dataset
 from identify.executor import Executor, InProcess, Progress
 from identify.fit import Fit
 from identify.structure import Effect, Structure
-from identify.trace.contests import at_the_same_place, in_other_forms, led_on
+from identify.trace.contests import at_the_same_place
+from identify.trace.exchange import in_other_forms
 from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
+from identify.trace.to_the_end import led_on
 from identify.trace.tried import Tried, astray, misfit
 
 #: What an effect leaves at another minimum of the declared model, at most, over what the best does,
