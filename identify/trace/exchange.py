@@ -69,13 +69,15 @@ def in_each_form(
     available: Sequence[Effect],
     run: Executor,
     done: Collection[tuple[str, ...]] = (),
+    richer: bool = False,
 ) -> list[Tried]:
-    """Each effect of `t` in its other forms, but for what (by forms) is `done`."""
+    """Each effect of `t` in its other forms, but for what (by forms) is `done`; of several effects
+    that explain the data, in those of fewer numbers only, unless `richer` ones are wanted."""
     items = [
         (t, kept, e, form, data)
         for t, kept, e, form, data in forms_in_place(t, data, available, done)
         if not (form.refines and t.explains)
-        and not (t.explains and kept and len(form.parameters) >= len(e.parameters))
+        and (richer or not (t.explains and kept) or len(form.parameters) < len(e.parameters))
     ]
     items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
     return refitted(items, data, run)

@@ -359,11 +359,17 @@ class _Searching:
     def one_more(self, depth: int) -> bool:
         """Whether a claim has lacked one effect more: any, beside what hardly leaves noise, or a
         law, as the score tests beside it say beyond doubt. The lesser of two may stay under the
-        threshold of what must be explained, and a law whose shape is unknown has no score test."""
-        good = [t for t in against_chance(self.tried) if t.explains]
-        best = best_form(good) if good else None
-        if best is None or best.spread is not None or len(best.effects) >= depth:
+        threshold of what must be explained, and a law whose shape is unknown has no score test. Of
+        several, one in another form may be all that is lacking."""
+        best = self._best_law
+        if best is None or len(best.effects) >= depth:
             return False
+        if self._lacks_a_law(best) and len(best.effects) > 1 and not self.late():
+            known = {t.key_of_forms for t in self.tried}
+            self.tried += in_each_form(
+                best, self.data, self.available, self.run, known, richer=True
+            )
+            best = self._best_law or best
         found: list[Tried] = []
         deviating = [
             kind
@@ -372,13 +378,27 @@ class _Searching:
         ]
         if deviating and not self.late():
             found += self._beside_each_chance(best, deviating)
-        if best.key_of_forms not in self.extended:
-            more = [e for e in self.apart if joins(e, best.effects)]
-            scores = score_tests(best.fit.structure, self.data, best.fit, more, self.run)
-            lacking = best.fit_p < DOUBT or family_p(list(scores.values())) < MISSING
-            if lacking and not self.late():
-                found += self.grown([best])
+        if self._lacks_a_law(best) and not self.late():
+            found += self.grown([best])
         return any(t.explains and best.parts < t.parts for t in found)
+
+    @property
+    def _best_law(self) -> Tried | None:
+        """What would be claimed, if that is without chance."""
+        good = [t for t in against_chance(self.tried) if t.explains]
+        best = best_form(good) if good else None
+        return None if best is None or best.spread is not None else best
+
+    def _lacks_a_law(self, best: Tried) -> bool:
+        """Whether it hardly leaves noise, or what it leaves follows another law beyond doubt; no
+        more, where it has been grown from."""
+        if best.key_of_forms in self.extended:
+            return False
+        if best.fit_p < DOUBT:
+            return True
+        more = [e for e in self.apart if joins(e, best.effects)]
+        scores = score_tests(best.fit.structure, self.data, best.fit, more, self.run)
+        return family_p(list(scores.values())) < MISSING
 
     def _deviates(self, law: Tried, kind: Scatter) -> float:
         """Chance that noise alone makes the runs deviate so from a law as from this kind of it."""
