@@ -11,6 +11,7 @@ from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
+from identify.trace import selection
 from identify.trace.contests import NEAR, varied
 from identify.trace.fewer import with_fewer
 from identify.trace.foreseen import foreseen
@@ -18,7 +19,14 @@ from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place
 from identify.trace.stages import renamed
 from identify.trace.tried import tried
-from tests.trace_material import fitted, only, search_for, thesis_campaign, tried_as
+from tests.trace_material import (
+    fitted,
+    only,
+    search_for,
+    searching,
+    thesis_campaign,
+    tried_as,
+)
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
@@ -320,3 +328,31 @@ def test_a_loss_is_seen_where_the_velocity_is_taken(tmp_path: Path) -> None:
     steps = (0.1, 0.03, 0.01, 0.003, 0.0)
     fit = fit_orbits(ready.structure.with_effects(*own), ready.data, theta, continuation=steps)
     assert fit.chi2_per_dof < 2.0
+
+
+def test_of_two_that_explain_the_data_one_may_lack_another_form(tmp_path: Path) -> None:
+    """A delay of the speaker that had been taken for a pole left hardly more than noise beside
+    a drift, but what it left was taken for a third effect (58053)."""
+    truth = {
+        "actuator_dynamics": {"delay_s": 2.4e-4},
+        "parameter_drift": {"frequency_change": -0.004},
+    }
+    ready = thesis_campaign(tmp_path, 14, truth, noise_db=60.0)
+    base = start.fit_from_data(ready.structure, ready.data)
+    drift, pole, delay = (
+        by_key(k)
+        for k in ("parameter_drift:frequency", "actuator_dynamics:pole", "actuator_dynamics:delay")
+    )
+    alone = only(ready, base, drift.key)
+    pairs = trace.try_effects(
+        alone.fit.structure, ready.data, alone.fit, [pole], executor=InProcess(), keep=1,
+        far=False, progress=lambda share, text: None,
+    )  # fmt: skip
+    assert pairs[0].explains
+    assert pairs[0].fit_p < selection.DOUBT
+    going = replace(searching(base, available=[drift, pole, delay]), data=ready.data, tried=pairs)
+    assert not going.one_more(3)
+    best = trace.best_form([t for t in going.tried if t.explains])
+    assert best.key_of_forms == (delay.key, drift.key)
+    assert best.evidence < pairs[0].evidence - trace.EVIDENCE
+    assert {len(t.effects) for t in going.tried} == {2}
