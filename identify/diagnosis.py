@@ -341,10 +341,9 @@ def _judge(
     good = [t for t in good if not trace.outdone(t, pieces)]
     settled = [t for t in good if t.has_values]  # of these alone one is claimed
     if settled:
-        best = trace.best_form(settled)
         spreads = [t for t in tried if t.spread is not None and not t.explains]
         implausible = [t for t in tried if t.spread is None and t.adequate and not t.plausible]
-        others = trace.rivals(best, [*good, *spreads, *implausible])
+        best, others = trace.claimed(settled, [*good, *spreads, *implausible])
         words = best.words
         if not others:
             open_ = trace.other_forms(best, good)

@@ -16,7 +16,7 @@ from identify.fit import _another_sings, fit_orbits
 from identify.identification import prepare
 from identify.parameters import ParameterSet
 from identify.scatter import fit_scatter
-from identify.structure import MODAL, Mode
+from identify.structure import MODAL, Mode, Structure
 from identify.trace import selection
 from identify.trace.contests import at_the_same_place, in_their_places, reformed
 from identify.trace.exchange import in_each_form, in_other_forms, joins
@@ -147,6 +147,51 @@ def test_a_law_far_likelier_whose_values_are_not_known_is_a_rival(
     as_good = tried_as(fitted(12, 1.28), "flame_dynamics:second_time_scale")
     assert as_good.evidence > mode.evidence - 10.0
     assert trace.rivals(mode, [mode, as_good]) == []
+
+
+def known_to(share: float, key: str, chi2: float = 100.0) -> trace.Tried:
+    """An effect added to two modes, its numbers known to that share of their sizes, with no word of
+    the other numbers."""
+    effect = by_key(key)
+    structure = Structure(2).with_effects(effect)
+    size = np.array([max(abs(x), 1.0) for x in effect.to_internal([1e-4] * len(effect.parameters))])
+    theta = np.r_[np.ones(len(structure.parameters) - size.size), size]
+    jacobian = np.diag(np.r_[np.ones(theta.size - size.size), 1 / (share * size)])
+    fit = replace(fitted(theta.size, 1.0), structure=structure, theta=theta, jacobian=jacobian)
+    return trace.Tried((effect,), replace(fit, chi2=chi2), 1e-3, 0.5, 0.5)
+
+
+def test_numbers_that_must_be_tuned_speak_against_a_law(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A delay that two numbers of a resonance can make up, if finely tuned, is a delay (58057)."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    delay, finer = known_to(1e-4, "flame_delay"), known_to(1e-5, "flame_delay")
+    assert finer.tuned_evidence - delay.tuned_evidence == pytest.approx(2 * np.log(10), rel=1e-3)
+    # what the data do not know has not been tuned
+    vague = known_to(1e4, "flame_delay").tuned_evidence
+    assert known_to(1e6, "flame_delay").tuned_evidence == pytest.approx(vague, abs=0.01)
+    tuned = known_to(1e-4, "flame_dynamics:second_order")
+    loose = known_to(1.0, "flame_dynamics:second_order")
+    assert tuned.evidence == loose.evidence
+    assert tuned.evidence < delay.evidence + trace.EVIDENCE
+    assert trace.rivals(delay, [tuned]) == []
+    assert trace.rivals(delay, [loose]) == [loose]
+
+
+def test_what_all_runs_make_far_likelier_takes_the_place_of_the_best(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The fitted runs favour one law a little, the held-out runs another by far (56400)."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    lower = tried_as(fitted(12, 1.0), "channel_mismatch:gain")
+    truer = tried_as(fitted(12, 1.02), "flame_dynamics:pole")
+    lower, truer = replace(lower, held_out=(60.0, 30)), replace(truer, held_out=(30.0, 30))
+    both = [lower, truer]
+    assert trace.best_form(both) is lower
+    assert trace.claimed(both, both) == (truer, [])
+    near = replace(truer, held_out=(55.0, 30))
+    assert trace.claimed([lower, near], [lower, near]) == (lower, [near])
+    # what has no values cannot be claimed
+    assert trace.claimed([lower], both) == (lower, [truer])
 
 
 def test_chance_that_moves_no_run_is_none(tmp_path: Path) -> None:

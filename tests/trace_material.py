@@ -147,6 +147,14 @@ def searching(
     )
 
 
+class Supposed(trace.Tried):
+    """A set of effects with a fit of which only the misfit and the count of numbers are given."""
+
+    @property
+    def tuned_evidence(self) -> float:
+        return self.evidence_of_all
+
+
 def tried_as(fit: Fit, *keys: str) -> trace.Tried:
     """A set of effects with that fit, adequate on both kinds of runs."""
-    return trace.Tried(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)
+    return Supposed(tuple(by_key(k) for k in keys), fit, 1e-3, 0.5, 0.5)

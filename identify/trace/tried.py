@@ -18,7 +18,7 @@ from identify.dataset import Dataset
 from identify.effects import CANDIDATES, CATALOGUE
 from identify.effects.scatter import Scatter
 from identify.fit import Fit
-from identify.parameters import Estimate
+from identify.parameters import Estimate, Parameter
 from identify.results import Candidate
 from identify.scatter import Spread
 from identify.structure import Effect
@@ -34,6 +34,8 @@ VISIBLE = 10.0  # … a misfit of so much χ²/dof
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
 LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws leaves less by chance
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
+DECADES = 4.0  # over which the size of an effect may lie beforehand
+TINY = 1e-9  # of a number's scale: no smaller size is told apart
 LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 LOST = 1e6  # times its value: a standard error that says nothing of it
@@ -135,6 +137,22 @@ class Tried:
         return self.deviance + (self.fit.theta.size + more) * float(np.log(self.fit.residual.size))
 
     @property
+    def tuned_evidence(self) -> float:
+        """−2 ln of the probability of the data (of laws), but for what the declared model's own
+        numbers share: χ² of all runs, and how finely the effects' own had to be tuned, by Laplace's
+        method. Beforehand the size of an effect is as likely in any of `DECADES` decades."""
+        own = [q for e in self.effects for q in e.parameters]
+        widths = np.array([_width(q, self.fit.values[q.name]) for q in own])
+        beforehand = np.zeros((len(own), self.fit.theta.size))
+        at = [self.fit.structure.parameters.index[q.name] for q in own]
+        beforehand[range(len(own)), at] = 1.0 / widths
+        known = np.vstack([self.fit.jacobian, beforehand])
+        unit = np.maximum(np.linalg.norm(known, axis=0), 1e-100)  # columns of one length
+        lengths = np.linalg.svd(known / unit, compute_uv=False)
+        volume = np.log(unit).sum() + np.log(np.maximum(lengths, 1e-13 * lengths[0])).sum()
+        return float(self.chi2_of_all + 2 * volume + 2 * np.log(widths).sum())
+
+    @property
     def evidence_of_all(self) -> float:
         """The same as if all runs had been fitted, to first order (of laws)."""
         return self.evidence + self.held_out[0]
@@ -216,6 +234,14 @@ def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
     return Tried(effects, fit, error, fit_p, p_out, held_out=misfit_out)
 
 
+def _width(q: Parameter, value: float) -> float:
+    """Standard deviation, in its internal unit, of where a number may lie beforehand."""
+    if q.kind == "positive" and np.isfinite(q.upper) and q.lower > 0:
+        return float(np.log(q.upper / q.lower) / np.sqrt(2 * np.pi))
+    decades = float(DECADES * np.log(10.0) / np.sqrt(2 * np.pi))
+    return decades * (1.0 if q.kind == "positive" else max(abs(value) / q.scale, TINY))
+
+
 def best_by_name(tries: Sequence[Tried]) -> list[Tried]:
     """The best form of each set of effect names, best first."""
     best = first_of_each(sorted(tries, key=_merit), lambda t: t.key)
@@ -283,11 +309,24 @@ def foremost(tries: Sequence[Tried]) -> Tried | None:
     return min(near, key=lambda t: (len(t.effects), t.fit.chi2), default=None)
 
 
+def claimed(good: Sequence[Tried], others: Sequence[Tried]) -> tuple[Tried, list[Tried]]:
+    """The best of what explains the data by values, and its rivals among `others`. Which is best
+    the fitted runs say; one that all runs make far likelier takes its place (56400)."""
+    best = best_form(good)
+    found = rivals(best, others)
+    likelier = [t for t in found if any(t is g for g in good) and _less_likely(t, best) < -EVIDENCE]
+    if likelier:
+        best = best_form(likelier)
+        found = rivals(best, others)
+    return best, found
+
+
 def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
     """Adequate, plausible sets of other effects that the data do not rule out against `best`.
 
-    Laws are weighed by all runs: refitted to them, their evidence hardly differs. What only adds an
-    effect to one of them is none of its own. Among spreads the likelihood alone decides: how well
+    Laws are weighed by all runs: refitted to them, their evidence hardly differs; one whose numbers
+    must be tuned for that to be as likely is none. What only adds an effect to one of them is none
+    of its own. Among spreads the likelihood alone decides: how well
     the wanderings of a few runs fit a Gaussian says little of their cause; a law beside one must
     predict the held-out runs. A law may follow what chance did where a spread is about as likely,
     or likelier though it looks not quite random. Each in its best form that is a rival: one that
@@ -299,6 +338,7 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         if t.key != best.key
         and (t.explains or _chance_rivals(t, best) or _stands_for_another(t, best))
         and _less_likely(t, best) < EVIDENCE
+        and not _must_be_tuned(t, best)
         and not best.within(t)
         and not _extends(t, best)
     ]
@@ -312,6 +352,13 @@ def _less_likely(t: Tried, best: Tried) -> float:
     of_all = t.evidence_of_all - best.evidence_of_all
     laws = t.spread is None and best.spread is None
     return of_all if laws else min(of_all, t.evidence - best.evidence)
+
+
+def _must_be_tuned(t: Tried, best: Tried) -> bool:
+    """Whether one law would follow the data as well as another only with its numbers tuned so
+    finely that the other is far likelier: three numbers that make what one does."""
+    laws = t.spread is None and best.spread is None
+    return laws and t.tuned_evidence - best.tuned_evidence > EVIDENCE
 
 
 def _stands_for_another(t: Tried, best: Tried) -> bool:
