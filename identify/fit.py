@@ -624,12 +624,24 @@ def _factors(s: _State, low: FloatArray, high: FloatArray) -> _Factors:
 
 
 def covariance_of(jacobian: FloatArray) -> FloatArray:
-    """(JᵀJ)⁻¹ by SVD with scaled columns; undetermined directions get a very large variance."""
+    """(JᵀJ)⁻¹; undetermined directions get a very large variance."""
+    norm, sv, Vt = _scaled(jacobian)
+    return np.asarray(((Vt.T * (1.0 / sv**2)) @ Vt) / np.outer(norm, norm))
+
+
+def log_determinant_of(jacobian: FloatArray) -> float:
+    """ln det JᵀJ: minus that of `covariance_of`, which need not be formed for it."""
+    norm, sv, _ = _scaled(jacobian)
+    return float(2 * (np.log(norm).sum() + np.log(sv).sum()))
+
+
+def _scaled(jacobian: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Lengths of the columns, and singular values and directions of all of one length, none of the
+    values below what can be told from zero."""
     norm = np.sqrt(np.sum(jacobian**2, axis=0))
     norm = np.where(norm > 1e-100, norm, 1e-100)
     _, sv, Vt = np.linalg.svd(jacobian / norm, full_matrices=False)
-    inverse = 1.0 / np.maximum(sv, 1e-13 * max(float(sv[0]), 1e-300)) ** 2
-    return np.asarray(((Vt.T * inverse) @ Vt) / np.outer(norm, norm))
+    return norm, np.maximum(sv, 1e-13 * max(float(sv[0]), 1e-300)), Vt
 
 
 def fit_orbits(

@@ -180,7 +180,7 @@ def test_numbers_that_must_be_tuned_speak_against_a_law(monkeypatch: pytest.Monk
 def test_what_all_runs_make_far_likelier_takes_the_place_of_the_best(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The fitted runs favour one law a little, the held-out runs another by far (56400)."""
+    """The fitted runs favour one law a little, the held-out runs another by far."""
     monkeypatch.setattr(trace.Tried, "plausible", True)
     lower = tried_as(fitted(12, 1.0), "channel_mismatch:gain")
     truer = tried_as(fitted(12, 1.02), "flame_dynamics:pole")

@@ -451,12 +451,12 @@ def test_what_is_far_less_likely_in_a_coarse_form_is_contested_in_a_finer_one(
     sensor's lag were named instead)."""
     asked: list[tuple[str, str]] = []
 
-    def refitted(items: Sequence[Any], data: Dataset, run: Any) -> list[trace.Tried]:
+    def exchanged(items: Sequence[Any], data: Dataset, run: Any) -> list[trace.Tried]:
         asked.extend((old.key, new.key) for _, _, old, new, _ in items)
         return []
 
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    monkeypatch.setattr(contests, "refitted", refitted)
+    monkeypatch.setattr(contests, "exchanged", exchanged)
     skew = tried_as(fitted(1, 0.5), "channel_mismatch:skew")
     none = Dataset((), (), 0.0)
     for left, others in (

@@ -12,7 +12,7 @@ import numpy as np
 from identify.dataset import Dataset
 from identify.executor import Executor, Progress
 from identify.structure import Effect
-from identify.trace.exchange import Exchange, forms_in_place, in_each_form, refitted
+from identify.trace.exchange import Exchange, exchanged, forms_in_place, in_each_form
 from identify.trace.fewer import eliminate, part_of, with_fewer
 from identify.trace.stages import try_effects
 from identify.trace.to_the_end import UNSETTLED
@@ -165,7 +165,7 @@ def in_finer_forms(
         behind = t.key != best.key and not best.parts < t.parts
         if behind and t.evidence >= best.evidence + EVIDENCE:
             items += forms_in_place(t, data, finer, done)
-    return refitted(items, data, run)
+    return exchanged(items, data, run)
 
 
 def at_the_same_place(
@@ -191,7 +191,7 @@ def at_the_same_place(
         and not e.refines
         and key_of_forms((*kept, e)) not in done
     ]
-    return refitted(items, data, run)
+    return exchanged(items, data, run)
 
 
 def _may_stand_for(e: Effect, old: Effect, t: Tried) -> bool:
@@ -261,4 +261,4 @@ def _from_the_end(
         for e in available
         if e.name not in t.names and not e.refines and key_of_forms((*kept, e)) not in done
     ]
-    return refitted(others, data, run)
+    return exchanged(others, data, run)

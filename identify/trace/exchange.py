@@ -80,7 +80,7 @@ def in_each_form(
         and (richer or not (t.explains and kept) or len(form.parameters) < len(e.parameters))
     ]
     items.sort(key=lambda item: not item[3].refines)  # which take longest: not to be waited for
-    return refitted(items, data, run)
+    return exchanged(items, data, run)
 
 
 def forms_in_place(
@@ -103,7 +103,8 @@ def forms_in_place(
     return out
 
 
-def refitted(items: Sequence[Exchange], data: Dataset, run: Executor) -> list[Tried]:
+def exchanged(items: Sequence[Exchange], data: Dataset, run: Executor) -> list[Tried]:
+    """What comes of each exchange, refitted; nothing of those that come to nothing finite."""
     fits = [fit for fit in run.map(_in_form, items) if fit is not None and np.isfinite(fit.chi2)]
     return [tried(fit.structure.effects, fit, data) for fit in fits]
 

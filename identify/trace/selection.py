@@ -364,12 +364,15 @@ class _Searching:
         best = self._best_law
         if best is None or len(best.effects) >= depth:
             return False
-        if self._lacks_a_law(best) and len(best.effects) > 1 and not self.late():
+        lacking = self._lacks_a_law(best)
+        if lacking and len(best.effects) > 1 and not self.late():
             known = {t.key_of_forms for t in self.tried}
             self.tried += in_each_form(
                 best, self.data, self.available, self.run, known, richer=True
             )
-            best = self._best_law or best
+            better = self._best_law
+            if better is not None and better is not best:
+                best, lacking = better, self._lacks_a_law(better)
         found: list[Tried] = []
         deviating = [
             kind
@@ -378,7 +381,7 @@ class _Searching:
         ]
         if deviating and not self.late():
             found += self._beside_each_chance(best, deviating)
-        if self._lacks_a_law(best) and not self.late():
+        if lacking and not self.late():
             found += self.grown([best])
         return any(t.explains and best.parts < t.parts for t in found)
 

@@ -17,7 +17,7 @@ from identify.chances import chi2_tail
 from identify.dataset import Dataset
 from identify.effects import CANDIDATES, CATALOGUE
 from identify.effects.scatter import Scatter
-from identify.fit import Fit
+from identify.fit import Fit, log_determinant_of
 from identify.parameters import Estimate, Parameter
 from identify.results import Candidate
 from identify.scatter import Spread
@@ -146,11 +146,8 @@ class Tried:
         beforehand = np.zeros((len(own), self.fit.theta.size))
         at = [self.fit.structure.parameters.index[q.name] for q in own]
         beforehand[range(len(own)), at] = 1.0 / widths
-        known = np.vstack([self.fit.jacobian, beforehand])
-        unit = np.maximum(np.linalg.norm(known, axis=0), 1e-100)  # columns of one length
-        lengths = np.linalg.svd(known / unit, compute_uv=False)
-        volume = np.log(unit).sum() + np.log(np.maximum(lengths, 1e-13 * lengths[0])).sum()
-        return float(self.chi2_of_all + 2 * volume + 2 * np.log(widths).sum())
+        known = log_determinant_of(np.vstack([self.fit.jacobian, beforehand]))
+        return float(self.chi2_of_all + known + 2 * np.log(widths).sum())
 
     @property
     def evidence_of_all(self) -> float:
@@ -311,7 +308,7 @@ def foremost(tries: Sequence[Tried]) -> Tried | None:
 
 def claimed(good: Sequence[Tried], others: Sequence[Tried]) -> tuple[Tried, list[Tried]]:
     """The best of what explains the data by values, and its rivals among `others`. Which is best
-    the fitted runs say; one that all runs make far likelier takes its place (56400)."""
+    the fitted runs say; one that all runs make far likelier takes its place."""
     best = best_form(good)
     found = rivals(best, others)
     likelier = [t for t in found if any(t is g for g in good) and _less_likely(t, best) < -EVIDENCE]
@@ -326,11 +323,11 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
 
     Laws are weighed by all runs: refitted to them, their evidence hardly differs; one whose numbers
     must be tuned for that to be as likely is none. What only adds an effect to one of them is none
-    of its own. Among spreads the likelihood alone decides: how well
-    the wanderings of a few runs fit a Gaussian says little of their cause; a law beside one must
-    predict the held-out runs. A law may follow what chance did where a spread is about as likely,
-    or likelier though it looks not quite random. Each in its best form that is a rival: one that
-    extends `best` must not hide another.
+    of its own. Among spreads the likelihood alone decides: how well the wanderings of a few runs
+    fit a Gaussian says little of their cause; a law beside one must predict the held-out runs. A
+    law may follow what chance did where a spread is about as likely, or likelier though it looks
+    not quite random. Each in its best form that is a rival: one that extends `best` must not hide
+    another.
     """
     every = [
         t
@@ -338,9 +335,9 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
         if t.key != best.key
         and (t.explains or _chance_rivals(t, best) or _stands_for_another(t, best))
         and _less_likely(t, best) < EVIDENCE
-        and not _must_be_tuned(t, best)
         and not best.within(t)
         and not _extends(t, best)
+        and not _must_be_tuned(t, best)
     ]
     found = best_by_name(every)
     return [t for t in found if not any(o.within(t) for o in found)]
