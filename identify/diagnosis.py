@@ -353,6 +353,10 @@ def _judge(
                 if open_[e.name]
             ]
             said = f"Adding {words} explains the data; no rival does."
+            said += "".join(
+                f" {t.words} would do as well, but {t.implausibility}."
+                for t in trace.but_for_values(best, implausible)
+            )
             if best.spread is not None and best.spread.objection:
                 said += f" No law comes near: that {best.spread.objection} is put down to luck."
             if best.spread is not None:

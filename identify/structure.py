@@ -218,7 +218,7 @@ class Effect:
     location: str = ""
     form: str = ""
     parameters: tuple[Parameter, ...] = ()
-    needs: tuple[str, ...] = ()  # what must be there: a "pressure", a "flame_pole" declared
+    needs: tuple[str, ...] = ()  # a "pressure" measured, or a "velocity" alone; a "flame_pole"
     generalises: tuple[str, ...] = ()  # effects of which this is an extension, not a rival
     mode_count: int | None = None  # only for declared models of that many modes
     located: tuple[str, ...] = ()  # parameters known to within their size, or it is not seen at all

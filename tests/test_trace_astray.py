@@ -8,6 +8,7 @@ import pytest
 
 import identify
 from identify import start, trace
+from identify.dataset import Batch
 from identify.effects import CANDIDATES, CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -80,7 +81,7 @@ def test_a_damping_that_no_mode_has_sends_the_search_afar() -> None:
 
 
 def test_what_stands_in_another_s_place_beside_a_gross_effect(tmp_path: Path) -> None:
-    """Of two gross effects neither leaves a place to start from: a microphone's lag that came up
+    """Of two gross effects neither leaves a place to start from: a sensor's lag that came up
     first beside a further mode gives way to the speaker's delay, from where it ended."""
     mode = {
         "frequency_hz": 394.0,
@@ -97,7 +98,7 @@ def test_what_stands_in_another_s_place_beside_a_gross_effect(tmp_path: Path) ->
     theta = np.r_[further.theta, both[1].to_internal((1e-4,))]
     truth = fit_orbits(structure, ready.data, theta, continuation=(0.003, 0.0), iterations=300)
     assert tried(tuple(both), truth, ready.data).explains
-    wrong = ready.structure.with_effects(both[0], by_key("sensor_dynamics:lowpass"))
+    wrong = ready.structure.with_effects(both[0], by_key("sensor_dynamics:slow"))
     first = tried(wrong.effects, fit_orbits(wrong, ready.data, truth.theta), ready.data)
     lucky = replace(first.fit, chi2=1.2 * first.fit.dof)  # as with a little more noise
     claimed = replace(first, fit=lucky, fit_p=0.1, validation_p=0.5, held_out=(0.0, 0))
@@ -539,17 +540,61 @@ def test_a_resonator_takes_energy_from_every_mode() -> None:
 
 
 def test_a_lag_of_the_sound_is_one_of_the_record(tmp_path: Path) -> None:
-    """A speaker's pole at 5 kHz: once the sensors' low-pass stands for it, the pole is tried from
-    its values, which no start of its own had led to (effects 33032: «traced» sensor_dynamics)."""
+    """A speaker's pole at 5 kHz: where the sensors' low-pass stands for it, the pole is tried from
+    its values, which no start of its own had led to (effects 33032). No microphone is so slow."""
     ready, base = recorded(
         tmp_path, 3, "actuator_dynamics/voice_coil", noise_db=30.0, pole_hz=5000.0
     )
     lowpass = only(ready, base, "sensor_dynamics:lowpass")
-    assert lowpass.explains
+    assert lowpass.adequate
+    assert "sensor_dynamics.time_s is at the edge of its range" in lowpass.implausibility
     found = at_the_same_place([lowpass], ready.data, CANDIDATES, InProcess())
     by = {t.effects[0].key: t for t in found}
-    assert by["actuator_dynamics:pole"].explains
-    assert trace.rivals(lowpass, list(by.values()))
+    pole = by["actuator_dynamics:pole"]
+    assert pole.explains
+    assert trace.rivals(pole, [lowpass]) == []
+    assert trace.but_for_values(pole, [lowpass]) == [lowpass]
+
+
+def test_a_lag_that_microphones_may_have_is_a_rival(tmp_path: Path) -> None:
+    """A speaker 6 µs late: microphones with a corner at 25 kHz would record the same."""
+    ready, base = recorded(tmp_path, 3, "actuator_dynamics/delay", noise_db=60.0, delay_s=6e-6)
+    delay, lowpass = (
+        only(ready, base, key) for key in ("actuator_dynamics:delay", "sensor_dynamics:lowpass")
+    )
+    assert delay.explains
+    assert lowpass.explains
+    assert trace.rivals(delay, [lowpass]) == [lowpass]
+    assert trace.but_for_values(delay, [lowpass]) == []
+
+
+def test_what_would_do_but_for_its_values_is_named(tmp_path: Path) -> None:
+    """A speaker 20 µs late is claimed, and what the claim rests on is said."""
+    ready, _ = recorded(tmp_path, 3, "actuator_dynamics/delay", noise_db=40.0, delay_s=2e-5)
+    lags = [by_key(k) for k in ("actuator_dynamics:delay", "sensor_dynamics:lowpass")]
+    found = identify.diagnose(ready.campaign, catalogue=lags)
+    assert (found.verdict, [e.effect for e in found.effects]) == ("traced", ["actuator_dynamics"])
+    assert (
+        "sensor_dynamics would do as well, but sensor_dynamics.time_s is at the edge of its range"
+        in found.explanation
+    )
+
+
+def test_how_slow_a_sensor_may_be_depends_on_what_gives_the_velocity(tmp_path: Path) -> None:
+    """Two microphones are fast; what measures a velocity by itself, a hot wire say, need not be."""
+    ready, _ = recorded(tmp_path, 5, "")
+    fast, slow = by_key("sensor_dynamics:lowpass"), by_key("sensor_dynamics:slow")
+    assert trace.usable(fast, ready.data, ready.structure)
+    assert not trace.usable(slow, ready.data, ready.structure)
+
+    def alone(b: Batch) -> Batch:
+        return replace(b, at=replace(b.at, pressure=np.zeros_like(b.at.pressure)))
+
+    by_itself = replace(ready.data, fit=tuple(alone(b) for b in ready.data.fit))
+    assert not trace.usable(fast, by_itself, ready.structure)
+    assert trace.usable(slow, by_itself, ready.structure)
+    assert not fast.parameters[0].plausible(2e-5)
+    assert slow.parameters[0].plausible(1e-3)
 
 
 def test_a_search_that_runs_out_of_time_keeps_what_it_found(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from identify.trace.tried import (
     best_by_name,
     best_form,
     best_of_each_form,
+    first_of_each,
     key_of_forms,
     misfit,
 )
@@ -174,20 +175,21 @@ def at_the_same_place(
     """Other effects at the location of each that explains the data, from where it ended; of those
     at the other end of the way from the drive to the record, those that its values start.
 
-    They are the likeliest to predict the same, and may have lost their way on coarse noise.
+    They are the likeliest to predict the same, and may have lost their way on coarse noise. A law
+    whose values cannot be true may stand for one of theirs, and is started from as well.
     """
-    good = [t for t in tries if t.explains]
-    if not good:
-        return []
-    best = best_form(good)
+    explaining = [t for t in tries if t.explains]
+    laws = [t for t in tries if t.adequate and t.spread is None]
+    best = [best_form(good) for good in (explaining, laws) if good]
     done = {t.key_of_forms for t in tries if t.adequate}
     items = [
-        (best, kept, old, e, data)
-        for old in best.effects
-        for kept in [tuple(o for o in best.effects if o is not old)]
+        (t, kept, old, e, data)
+        for t in first_of_each(best, lambda t: t.key_of_forms).values()
+        for old in t.effects
+        for kept in [tuple(o for o in t.effects if o is not old)]
         for e in available
-        if _may_stand_for(e, old, best)
-        and e.name not in best.names
+        if _may_stand_for(e, old, t)
+        and e.name not in t.names
         and not e.refines
         and key_of_forms((*kept, e)) not in done
     ]

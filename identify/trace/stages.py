@@ -549,4 +549,5 @@ def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
         return False
     if "flame_pole" in effect.needs and structure.flame_order == 0:
         return False
-    return "pressure" not in effect.needs or knows_pressure(data)
+    measured = "pressure" if knows_pressure(data) else "velocity"
+    return not {"pressure", "velocity"} - {measured} & set(effect.needs)

@@ -351,6 +351,25 @@ def _less_likely(t: Tried, best: Tried) -> float:
     return of_all if laws else min(of_all, t.evidence - best.evidence)
 
 
+def but_for_values(best: Tried, others: Sequence[Tried]) -> list[Tried]:
+    """Laws of no more effects that would be rivals of the law `best` if their values could be
+    true."""
+    if best.spread is not None:
+        return []
+    near = [
+        t
+        for t in others
+        if t.spread is None
+        and t.key != best.key
+        and t.adequate
+        and not t.plausible
+        and len(t.effects) <= len(best.effects)
+        and _less_likely(t, best) < EVIDENCE
+        and not _must_be_tuned(t, best)
+    ]
+    return best_by_name(near)
+
+
 def _must_be_tuned(t: Tried, best: Tried) -> bool:
     """Whether one law would follow the data as well as another only with its numbers tuned so
     finely that the other is far likelier: three numbers that make what one does."""
