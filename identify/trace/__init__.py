@@ -25,6 +25,15 @@
    where one alone contradicts the declared model, its recording is doubted (`lone`).
 """
 
+from identify.trace.claims import (
+    accounts,
+    but_for_values,
+    candidate,
+    claimed,
+    other_forms,
+    outdone,
+    rivals,
+)
 from identify.trace.lone import lone_run
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
@@ -37,22 +46,7 @@ from identify.trace.selection import (
     without_effects,
 )
 from identify.trace.stages import started_again, try_effects, usable
-from identify.trace.tried import (
-    ALPHA,
-    EVIDENCE,
-    Tried,
-    accounts,
-    astray,
-    best_by_name,
-    best_form,
-    but_for_values,
-    candidate,
-    claimed,
-    foremost,
-    other_forms,
-    outdone,
-    rivals,
-)
+from identify.trace.tried import ALPHA, EVIDENCE, Tried, astray, best_by_name, best_form, foremost
 
 __all__ = [
     "ALPHA",

@@ -8,8 +8,9 @@ import numpy as np
 from identify.dataset import Dataset
 from identify.fit import Fit, fit_orbits
 from identify.structure import MODAL, Effect, Structure
+from identify.trace.claims import gain_p
 from identify.trace.stages import louder, loudness
-from identify.trace.tried import ALPHA, Tried, gain_p, tried
+from identify.trace.tried import ALPHA, Tried, tried
 
 NEEDLESS = 100.0  # of χ²: what leaving an effect out adds at most, if it is to be left out
 

@@ -25,6 +25,7 @@ from identify.trace.beside_chance import (
     without_chance,
     without_law,
 )
+from identify.trace.claims import accounts, foretold
 from identify.trace.contests import (
     BEHIND,
     at_the_same_place,
@@ -55,13 +56,11 @@ from identify.trace.tried import (
     EVIDENCE,
     GROSS,
     Tried,
-    accounts,
     astray,
     best_by_name,
     best_form,
     best_of_each_form,
     foremost,
-    foretold,
     misfit,
     tried,
 )

@@ -1,4 +1,4 @@
-"""A set of effects refitted, and how such sets compare: which explain, which is best, which rival.
+"""A set of effects refitted: whether it explains the data, and which of several comes first.
 
 Selection is by lack of fit and held-out runs with corrected significance; information criteria
 only weigh candidates that are adequate already: χ² + p ln n, within 10 of the best.
@@ -10,16 +10,13 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from scipy import stats
 
 from identify import assess
-from identify.chances import chi2_tail
 from identify.dataset import Dataset
-from identify.effects import CANDIDATES, CATALOGUE
+from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.fit import Fit, log_determinant_of
 from identify.parameters import Estimate, Parameter
-from identify.results import Candidate
 from identify.scatter import Spread
 from identify.structure import Effect
 
@@ -39,9 +36,6 @@ TINY = 1e-9  # of a number's scale: no smaller size is told apart
 LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
 LOST = 1e6  # times its value: a standard error that says nothing of it
-WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it …
-WORSE_P = 0.05  # … and any worse, where noise leaves as much as that by so small a chance
-ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 USUAL = 3.0  # what a form must gain on one of the same effect that stands before it: more usual
 
@@ -304,209 +298,3 @@ def foremost(tries: Sequence[Tried]) -> Tried | None:
     least = min((t.fit.chi2 for t in tries), default=np.inf)
     near = [t for t in tries if t.fit.chi2 <= 3 * least]
     return min(near, key=lambda t: (len(t.effects), t.fit.chi2), default=None)
-
-
-def claimed(good: Sequence[Tried], others: Sequence[Tried]) -> tuple[Tried, list[Tried]]:
-    """The best of what explains the data by values, and its rivals among `others`. Which is best
-    the fitted runs say; one that all runs make far likelier takes its place."""
-    best = best_form(good)
-    found = rivals(best, others)
-    likelier = [t for t in found if any(t is g for g in good) and _less_likely(t, best) < -EVIDENCE]
-    if likelier:
-        best = best_form(likelier)
-        found = rivals(best, others)
-    return best, found
-
-
-def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
-    """Adequate, plausible sets of other effects that the data do not rule out against `best`.
-
-    Laws are weighed by all runs: refitted to them, their evidence hardly differs; one whose numbers
-    must be tuned for that to be as likely is none. What only adds an effect to one of them is none
-    of its own. Among spreads the likelihood alone decides: how well the wanderings of a few runs
-    fit a Gaussian says little of their cause; a law beside one must predict the held-out runs. A
-    law may follow what chance did where a spread is about as likely, or likelier though it looks
-    not quite random. Each in its best form that is a rival: one that extends `best` must not hide
-    another.
-    """
-    every = [
-        t
-        for t in others
-        if t.key != best.key
-        and (t.explains or _chance_rivals(t, best) or _stands_for_another(t, best))
-        and _less_likely(t, best) < EVIDENCE
-        and not best.within(t)
-        and not _extends(t, best)
-        and not _must_be_tuned(t, best)
-    ]
-    found = best_by_name(every)
-    return [t for t in found if not any(o.within(t) for o in found)]
-
-
-def _less_likely(t: Tried, best: Tried) -> float:
-    """By how much of χ² + p ln n the data speak for `best`: all of them, the held-out runs too. A
-    spread takes these for whatever it widens them to: its fitted runs must speak for it as well."""
-    of_all = t.evidence_of_all - best.evidence_of_all
-    laws = t.spread is None and best.spread is None
-    return of_all if laws else min(of_all, t.evidence - best.evidence)
-
-
-def but_for_values(best: Tried, others: Sequence[Tried]) -> list[Tried]:
-    """Laws of no more effects that would be rivals of the law `best` if their values could be
-    true."""
-    if best.spread is not None:
-        return []
-    near = [
-        t
-        for t in others
-        if t.spread is None
-        and t.key != best.key
-        and t.adequate
-        and not t.plausible
-        and len(t.effects) <= len(best.effects)
-        and _less_likely(t, best) < EVIDENCE
-        and not _must_be_tuned(t, best)
-    ]
-    return best_by_name(near)
-
-
-def _must_be_tuned(t: Tried, best: Tried) -> bool:
-    """Whether one law would follow the data as well as another only with its numbers tuned so
-    finely that the other is far likelier: three numbers that make what one does."""
-    laws = t.spread is None and best.spread is None
-    return laws and t.tuned_evidence - best.tuned_evidence > EVIDENCE
-
-
-def _stands_for_another(t: Tried, best: Tried) -> bool:
-    """Whether a law of no more effects is far likelier, though its values cannot be true, or the
-    data do not tell them."""
-    if t.spread is not None or t.plausible or len(t.effects) > len(best.effects):
-        return False
-    return t.adequate and t.evidence < best.evidence - EVIDENCE
-
-
-def _chance_rivals(spread: Tried, best: Tried) -> bool:
-    if spread.spread is None:
-        return False
-    if best.spread is not None:
-        return spread.plausible and (spread.adequate or len(spread.effects) == 1)
-    random = spread.objection in ("", BEATEN)
-    return spread.adequate and spread.evidence < best.evidence + (EVIDENCE if random else 0.0)
-
-
-def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ...]]:
-    """By effect, its other forms that the data do not rule out against those of `best`."""
-    out: dict[str, list[str]] = {name: [] for name in best.names}
-    for t in others:
-        if t.key != best.key or not t.explains:
-            continue
-        if t.evidence < best.evidence + EVIDENCE:
-            for e in t.effects:
-                out[e.name].append(e.form)
-    own = {(e.name, e.form) for e in best.effects}
-    return {
-        n: tuple(f for f in dict.fromkeys(forms) if (n, f) not in own) for n, forms in out.items()
-    }
-
-
-def _extends(t: Tried, best: Tried) -> bool:
-    """Whether `t` is `best` with an extension that the data do not ask for."""
-    general = {n for e in t.effects for n in e.generalises}
-    return t.fit.theta.size > best.fit.theta.size and best.parts <= t.parts | general
-
-
-def gain_p(gain: float, t: Tried, without: Fit) -> float:
-    """Chance of a gain in χ² of `t` on a model with fewer effects, corrected for those asked."""
-    freedom = max(t.fit.theta.size - without.theta.size, 1)
-    return min(1.0, chi2_tail(gain, freedom) * len(CATALOGUE))
-
-
-def _beside_chance_p(t: Tried, alone: Tried) -> float:
-    """The same of what a law gains beside a spread on that spread alone: its σ comes from a few
-    runs' deviations, N in all, which so many numbers may follow (45153). By F, which the likelihood
-    of a Gaussian of unknown variance has: gain = N ln(1 + k F/(N − k))."""
-    assert t.spread is not None
-    runs = sum(b.runs for b in t.spread.data.fit if not b.free)
-    count, freedom = runs * len(t.spread.sizes), max(t.fit.theta.size - alone.fit.theta.size, 1)
-    gain = alone.deviance - t.deviance
-    if gain <= 0 or count <= freedom:
-        return 1.0
-    ratio = float(np.expm1(min(gain / count, 500.0))) * (count - freedom) / freedom
-    return min(1.0, float(stats.f.sf(ratio, freedom, count - freedom)) * len(CATALOGUE))
-
-
-def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
-    """Whether the misfit that is left without one of the effects goes with it: more than chance
-    takes away, and two thirds of what exceeds the noise, and the held-out runs are predicted no
-    worse than by fewer effects in their best forms. What takes a part of little may leave the cause
-    behind, under the threshold. A spread does so by widening the noise: its likelihood is penalised
-    for that, and must still gain, on the law beside it and, so that one is claimed, on the spread
-    alone, more than the likeliest of all laws does by chance. And chance beside a law does not make
-    the prediction many times worse (alone, it does where the declared model had followed it)."""
-    fewer = [o for o in tries if o.spread is None and o.parts < t.parts]
-    without = min([declared, *fewer], key=lambda o: o.chi2_of_all)
-    mostly = t.excess < without.excess / 3
-    if t.spread is not None:
-        alone = [o for o in tries if o.spread and o.within(t)]
-        found = all(_beside_chance_p(t, o) < ALPHA for o in alone)
-        least = min([without.evidence, *(o.evidence for o in alone)])
-        hidden = t.validation_error > ASTRAY * declared.validation_error
-        lost = len(t.effects) > 1 and hidden
-        return mostly and found and not lost and t.evidence < least - EVIDENCE
-    worse = any(_predicts_worse(t, o) for o in best_by_name(fewer))
-    gain = without.chi2_of_all - t.chi2_of_all
-    return gain_p(gain, t, without.fit) < ALPHA and mostly and not worse
-
-
-def _predicts_worse(t: Tried, o: Tried) -> bool:
-    """Whether `t` predicts the held-out runs worse than `o`: much, or a little and hardly by chance
-    either. Near the noise a few runs decide nothing (44014)."""
-    more = t.validation_error / o.validation_error
-    return more > WORSE or (more > 1.0 and t.validation_p < min(WORSE_P, o.validation_p))
-
-
-def foretold(t: Tried, error: float) -> bool:
-    """Whether held-out runs that a law predicts with that `error` do not scatter as the spread `t`
-    has it: they would lie so near to their middle by chance, each along one direction at least."""
-    if t.spread is None or not error < t.validation_error < np.inf:
-        return False
-    runs = sum(b.runs for b in t.spread.data.validation)
-    nearer = runs * (error / t.validation_error) ** 2
-    return 1.0 - chi2_tail(nearer, runs) < ALPHA
-
-
-def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
-    """Whether a freely shaped piece is far likelier, complexity counted: then the cause is one that
-    nobody has named, and `t` only comes near to it. Chance at one place is asked so of chance at
-    another alone."""
-    good = [p for p in pieces if (p.adequate if p.spread is None else p.explains and t.spread)]
-    return any(p.evidence < t.evidence - EVIDENCE for p in good)
-
-
-def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
-    """The candidate's line of the report: its gain over the declared model, corrected."""
-    own = {q.name for e in t.effects for q in e.parameters}
-    return Candidate(
-        effects=t.names,
-        forms=tuple(e.form for e in t.effects),
-        locations=tuple(e.location for e in t.effects),
-        chi2=t.fit.chi2,
-        chi2_per_dof=t.fit.chi2_per_dof,
-        validation_error=t.validation_error,
-        p_value=gain_p(declared.chi2 - t.fit.chi2, t, declared),
-        parameters={n: e for n, e in t.estimates.items() if n in own},
-        equivalent_to=tuple(equal),
-        plausible=t.plausible,
-        adequate=t.adequate,
-        note=_note(t),
-    )
-
-
-def _note(t: Tried) -> str:
-    if not t.fit.converged:
-        return t.fit.reason
-    if not t.plausible:
-        return t.implausibility
-    if t.spread is None:
-        return ""
-    return "leaves more than noise" if t.adequate and not t.leaves_noise else ""
