@@ -69,7 +69,7 @@ class Spread:
     penalty: float
     objection: str
     luck: float = 1.0  # chance of what is objected to, were the deviations random; 0: not so asked
-    unrivalled: bool = False  # no law comes near (`identify.trace.selection.unrivalled`)
+    unrivalled: bool = False  # no law comes near (`identify.trace.claims.unrivalled`)
 
 
 @dataclass(frozen=True)

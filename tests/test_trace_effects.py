@@ -35,11 +35,11 @@ from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
 from identify.trace import selection
 from identify.trace.beside_chance import other_forms_beside_chance, without_law
+from identify.trace.claims import against_chance
 from identify.trace.exchange import in_other_forms
 from identify.trace.fewer import eliminate, named_otherwise
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import chance_test, scan
-from identify.trace.selection import against_chance
 from identify.trace.stages import by_name, known_sizes, try_scatters
 from identify.trace.to_the_end import settled
 from identify.trace.tried import tried

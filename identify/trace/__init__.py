@@ -20,31 +20,26 @@
    loop it lies; a memory, and runs that each deviate, where no smooth shape does (`places`). Where
    none of all these but a spread, or one law beside one, comes near, that is claimed though it
    looks a little less random, or leaves a little more, than most: with no law to hide, it is
-   (`selection.unrivalled`).
+   (`claims.unrivalled`).
 6. Before nothing, several effects, a spread or a law of many numbers is said, each run is left out:
    where one alone contradicts the declared model, its recording is doubted (`lone`).
 """
 
 from identify.trace.claims import (
     accounts,
+    against_chance,
     but_for_values,
     candidate,
     claimed,
     other_forms,
     outdone,
     rivals,
+    unrivalled,
 )
 from identify.trace.lone import lone_run
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
-from identify.trace.selection import (
-    Cancelled,
-    against_chance,
-    refitted,
-    search,
-    unrivalled,
-    without_effects,
-)
+from identify.trace.selection import Cancelled, refitted, search, without_effects
 from identify.trace.stages import started_again, try_effects, usable
 from identify.trace.tried import ALPHA, EVIDENCE, Tried, astray, best_by_name, best_form, foremost
 

@@ -5,6 +5,7 @@ whether the misfit goes with it, `outdone` whether a shape without a law leaves 
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
@@ -18,6 +19,8 @@ from identify.trace.tried import ALPHA, BEATEN, EVIDENCE, Tried, best_by_name, b
 WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise alone may have it …
 WORSE_P = 0.05  # … and any worse, where noise leaves as much as that by so small a chance
 ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
+MUCH = 30.0  # χ²/dof that a law leaves, or pairs, beyond which they are not near the data
+NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 
 
 def claimed(good: Sequence[Tried], others: Sequence[Tried]) -> tuple[Tried, list[Tried]]:
@@ -187,6 +190,45 @@ def foretold(t: Tried, error: float) -> bool:
     runs = sum(b.runs for b in t.spread.data.validation)
     nearer = runs * (error / t.validation_error) ** 2
     return 1.0 - chi2_tail(nearer, runs) < ALPHA
+
+
+def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
+    """A law that does better than a spread speaks against chance, even one of implausible values,
+    or one of `others`: it stands for one that is not known. So does one that comes near and
+    predicts held-out runs far better than they would scatter."""
+    laws = [t for t in (*tries, *others) if t.spread is None]
+    least = min((t.evidence for t in laws if t.adequate), default=np.inf)
+    # what misses the fitted runs by far meets a few held-out ones by luck (43096)
+    near = [t for t in laws if t.held_out[1] and t.fit.chi2_per_dof < MUCH]
+    nearest = min((t.validation_error for t in near), default=np.inf)
+    out = []
+    for t in tries:
+        if t.spread is not None and (t.evidence > least or foretold(t, nearest)):
+            spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
+            out.append(replace(t, spread=spread))
+        else:
+            out.append(t)
+    return out
+
+
+def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
+    """Spreads are marked where no law comes near the data: none of `tries`, and none of the
+    freely shaped `pieces`, which may follow the runs' conditions however they like. Beside a law,
+    only that of which no other does as well as to be adequate.
+
+    There is then no law that a spread could hide, and what speaks against it by a small chance
+    alone (`tried.LUCK`) is what so many questions bring about now and then.
+    """
+    laws = [t.fit.chi2_per_dof for t in (*tries, *pieces) if t.spread is None]
+    if min(laws, default=0.0) <= NO_CHANCE:
+        return list(tries)
+    beside = {t.key for t in tries if t.spread is not None and len(t.effects) > 1 and t.adequate}
+    return [
+        replace(t, spread=replace(t.spread, unrivalled=True))
+        if t.spread is not None and (len(t.effects) == 1 or beside == {t.key})
+        else t
+        for t in tries
+    ]
 
 
 def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:

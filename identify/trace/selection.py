@@ -25,7 +25,7 @@ from identify.trace.beside_chance import (
     without_chance,
     without_law,
 )
-from identify.trace.claims import accounts, foretold
+from identify.trace.claims import MUCH, NO_CHANCE, accounts, against_chance
 from identify.trace.contests import (
     BEHIND,
     at_the_same_place,
@@ -52,7 +52,6 @@ from identify.trace.stages import (
 from identify.trace.to_the_end import led_on, settled
 from identify.trace.tried import (
     ALPHA,
-    BEATEN,
     EVIDENCE,
     GROSS,
     Tried,
@@ -70,11 +69,9 @@ CHANCE_SOFTENED, LAW_SOFTENED = (0.001, 0.005, 0.02), (0.005, 0.02)
 FOREMOST, FORMS = 2, 4  # laws seen there beside which chance is tried, and forms of each …
 ALIKE = 1.05  # … that leave no more than so many times the least
 SHORTENED = 2  # best sets of a level from which the needless is left out even if none explains
-MUCH = 30.0  # χ²/dof that a law leaves, or pairs, beyond which they are not near the data
 PLAINLY = 0.3  # of the declared misfit: what an effect of one number leaves that is grown from too
 NOWHERE = 1e-4  # share of a gross misfit: a set that leaves more lacks more than another form
 STANDS_OUT = 30.0  # times less misfit than with any other effect
-NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 MINIMA = 2  # of the declared model, beside the deepest, from which effects are sought
 MISSING = 1e-6  # chance of the scores beside a law below which it lacks another, or chance …
 DOUBT = 0.05  # … and of what it leaves, below which either is tried whatever the scores
@@ -621,45 +618,6 @@ def _least(tries: Sequence[Tried]) -> float:
     """χ²/dof of the best of them that may be true; 0 of none."""
     likely = (t.fit.chi2_per_dof for t in tries if t.plausible)
     return min(likely, default=np.inf if tries else 0.0)
-
-
-def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
-    """A law that does better than a spread speaks against chance, even one of implausible values,
-    or one of `others`: it stands for one that is not known. So does one that comes near and
-    predicts held-out runs far better than they would scatter."""
-    laws = [t for t in (*tries, *others) if t.spread is None]
-    least = min((t.evidence for t in laws if t.adequate), default=np.inf)
-    # what misses the fitted runs by far meets a few held-out ones by luck (43096)
-    near = [t for t in laws if t.held_out[1] and t.fit.chi2_per_dof < MUCH]
-    nearest = min((t.validation_error for t in near), default=np.inf)
-    out = []
-    for t in tries:
-        if t.spread is not None and (t.evidence > least or foretold(t, nearest)):
-            spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
-            out.append(replace(t, spread=spread))
-        else:
-            out.append(t)
-    return out
-
-
-def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
-    """Spreads are marked where no law comes near the data: none of `tries`, and none of the
-    freely shaped `pieces`, which may follow the runs' conditions however they like. Beside a law,
-    only that of which no other does as well as to be adequate.
-
-    There is then no law that a spread could hide, and what speaks against it by a small chance
-    alone (`tried.LUCK`) is what so many questions bring about now and then.
-    """
-    laws = [t.fit.chi2_per_dof for t in (*tries, *pieces) if t.spread is None]
-    if min(laws, default=0.0) <= NO_CHANCE:
-        return list(tries)
-    beside = {t.key for t in tries if t.spread is not None and len(t.effects) > 1 and t.adequate}
-    return [
-        replace(t, spread=replace(t.spread, unrivalled=True))
-        if t.spread is not None and (len(t.effects) == 1 or beside == {t.key})
-        else t
-        for t in tries
-    ]
 
 
 def without_effects(structure: Structure, data: Dataset, tries: Sequence[Tried]) -> Fit | None:
