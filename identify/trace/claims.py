@@ -182,7 +182,7 @@ def _predicts_worse(t: Tried, o: Tried) -> bool:
     return more > WORSE or (more > 1.0 and t.validation_p < min(WORSE_P, o.validation_p))
 
 
-def foretold(t: Tried, error: float) -> bool:
+def _foretold(t: Tried, error: float) -> bool:
     """Whether held-out runs that a law predicts with that `error` do not scatter as the spread `t`
     has it: they would lie so near to their middle by chance, each along one direction at least."""
     if t.spread is None or not error < t.validation_error < np.inf:
@@ -203,7 +203,7 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
     nearest = min((t.validation_error for t in near), default=np.inf)
     out = []
     for t in tries:
-        if t.spread is not None and (t.evidence > least or foretold(t, nearest)):
+        if t.spread is not None and (t.evidence > least or _foretold(t, nearest)):
             spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
             out.append(replace(t, spread=spread))
         else:

@@ -549,5 +549,5 @@ def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
         return False
     if "flame_pole" in effect.needs and structure.flame_order == 0:
         return False
-    measured = "pressure" if knows_pressure(data) else "velocity"
-    return not {"pressure", "velocity"} - {measured} & set(effect.needs)
+    absent = "velocity" if knows_pressure(data) else "pressure"
+    return absent not in effect.needs
