@@ -85,11 +85,13 @@ class Harmonics:
         v = np.diag(self.covariance)
         return np.asarray(v[: self.count] + v[self.count :])
 
-    def doubted(self, factor: float) -> "Harmonics":
-        """The same with `factor` times the standard errors."""
+    def doubted(self, factor: float, error: float = 0.0) -> "Harmonics":
+        """The same with `factor` times the standard errors, and a relative `error` of harmonic k
+        that grows with k."""
+        wrong = error * np.arange(1, self.count + 1) * np.abs(self.velocity)
         return replace(
             self,
-            covariance=self.covariance * factor**2,
+            covariance=self.covariance * factor**2 + np.diag(np.tile(wrong**2 / 2, 2)),
             frequency_stderr_hz=self.frequency_stderr_hz * factor,
         )
 

@@ -78,7 +78,7 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
     found = quality.inspect(campaign)
     tones = {t.frequency_hz: t.amplitude for t in found.tones}
     measured = [
-        h.doubted(DOUBT) if h.name in found.doubted else h
+        h.doubted(DOUBT, found.doubted[h.name]) if h.name in found.doubted else h
         for h in harmonics.measure_campaign(campaign, skip=sorted(found.excluded), tones=tones)
     ]
     if not any(h.kind == "forced" and h.role == "fit" for h in measured):

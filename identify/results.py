@@ -28,13 +28,15 @@ Verdict = Literal["no_discrepancy", "traced", "ambiguous", "unexplained"]
 @dataclass(frozen=True)
 class QualityFlag:
     """Something wrong with one run's recording. `severity`: noted, down-weighted or excluded;
-    `harmonics`: those concerned, if not the whole run."""
+    `harmonics`: those concerned, if not the whole run; `error`: relative error of the run's
+    coefficients that it may cause, 0 where that is not known."""
 
     run: str
     flag: str
     detail: str
     severity: Literal["noted", "down_weighted", "excluded"] = "noted"
     harmonics: tuple[int, ...] = ()
+    error: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -43,6 +45,7 @@ class QualityFlag:
             "detail": self.detail,
             "severity": self.severity,
             "harmonics": list(self.harmonics),
+            "relative_error": number(self.error),
         }
 
 

@@ -240,8 +240,10 @@ def test_side_lines_near_the_free_frequency(
     clean: Campaign, db: float, severity: str | None
 ) -> None:
     """Twenty decibels below the free run's level is the thesis's limit."""
-    _, flags, _ = judged(clean, line(FREE_HZ, FREE_PA * 10 ** (db / 20), 1.047), 4)
+    found, flags, name = judged(clean, line(FREE_HZ, FREE_PA * 10 ** (db / 20), 1.047), 4)
     assert flags == ({} if severity is None else {"incompletely_entrained": severity})
+    assert set(found.doubted) == ({name} if severity == "down_weighted" else set())
+    assert all(5e-3 < error < 5e-2 for error in found.doubted.values())
 
 
 def test_a_run_that_does_not_lock(clean: Campaign) -> None:

@@ -24,6 +24,7 @@ LINE_SHARE = 0.3  # of the power in BAND (of the frequency) that a limit cycle h
 BAND = 0.3
 PURE = 8.0  # its power over that of the bins beside it
 WORTH_NOTING = 5e-4  # 2 (B/A)² below which nothing is said
+AMPLIFIED = 5.0  # times that the response may err by, near a resonance
 QUENCHED = 0.2  # of a forced run's level: a cycle below that does not survive it …
 ALIKE = 1.4  # … to within such a factor (the window's loss between bins is 1.1)
 LEAST_KEPT = 3
@@ -196,5 +197,6 @@ def entrainment(view: View, free: FreeLine | None) -> list[QualityFlag]:
     error = bias(side.level, own)
     if error > WORTH_NOTING:
         detail = f"{where}: biases the coefficients by about {error:.1e}; raise the drive or wait"
-        return [finding(view.name, "incompletely_entrained", "down_weighted", detail)]
+        worst = AMPLIFIED * error
+        return [finding(view.name, "incompletely_entrained", "down_weighted", detail, error=worst)]
     return []

@@ -10,9 +10,14 @@ Severity = Literal["noted", "down_weighted", "excluded"]
 
 
 def finding(
-    run: str, flag: str, severity: Severity, detail: str, harmonics: tuple[int, ...] = ()
+    run: str,
+    flag: str,
+    severity: Severity,
+    detail: str,
+    harmonics: tuple[int, ...] = (),
+    error: float = 0.0,
 ) -> QualityFlag:
-    return QualityFlag(run, flag, detail, severity, harmonics)
+    return QualityFlag(run, flag, detail, severity, harmonics, error)
 
 
 def decibel(ratio: float) -> float:

@@ -29,10 +29,14 @@ class Quality:
     tones: tuple[Tone, ...]
 
     @property
-    def doubted(self) -> frozenset[str]:
-        """Names of runs that enter a fit with less weight, all their harmonics."""
-        whole = (f for f in self.flags if not f.harmonics)
-        return frozenset(f.run for f in whole if f.severity == "down_weighted")
+    def doubted(self) -> dict[str, float]:
+        """Runs that enter a fit with less weight, all their harmonics, by name, and the relative
+        error that they may have."""
+        out: dict[str, float] = {}
+        for f in self.flags:
+            if f.severity == "down_weighted" and not f.harmonics:
+                out[f.run] = max(f.error, out.get(f.run, 0.0))
+        return out
 
 
 def inspect(campaign: Campaign) -> Quality:

@@ -136,7 +136,9 @@ def _flag(view: View, found: Trend, whose: str, remedy: str) -> QualityFlag:
         f"first half to the second, {shape} ({found.size / found.stderr:.0f} standard errors); "
         f"shifts the coefficient by {found.size:.1e}: {remedy}"
     )
-    return finding(view.name, "drift_inside_run" if line else "unsettled", severity, detail)
+    if line:  # its mean is that of its middle
+        return finding(view.name, "drift_inside_run", severity, detail)
+    return finding(view.name, "unsettled", severity, detail, error=found.size)
 
 
 def _seconds(view: View, found: Trend) -> float:
