@@ -227,6 +227,23 @@ def test_repeated_buffers_are_found(clean: Campaign, samples: int) -> None:
     assert found.excluded == {name}
 
 
+@pytest.mark.parametrize("channel", ["p1", "p2"])
+@pytest.mark.parametrize(("number", "samples"), [(0, 3), (3, 1), (3, 7), (4, 25)])
+def test_samples_lost_in_one_channel_are_no_beating(
+    clean: Campaign, channel: str, number: int, samples: int
+) -> None:
+    """Channels of two devices: a step's side lines are not taken for a cycle that goes on."""
+
+    def change(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return np.r_[np.delete(x, np.s_[9000 : 9000 + samples]), x[: -samples - 1 : -1]]
+
+    found, flags, name = judged(clean, one(channel, change), number)
+    assert flags == {"dropped_samples": "excluded"}
+    (flag,) = found.flags
+    assert flag.detail.startswith(f"{channel}: the phase steps by +")
+    assert found.excluded == {name}
+
+
 @pytest.mark.parametrize(("samples", "severity"), [(6, "down_weighted"), (40, "excluded")])
 def test_held_samples_are_found(clean: Campaign, samples: int, severity: str) -> None:
     assert judged(clean, hold(samples))[1] == {"repeated_samples": severity}

@@ -61,7 +61,7 @@ def inspect(campaign: Campaign) -> Quality:
     flags += forcing.silence(views)
     good = _kept(views, flags)
     for v in good:
-        flags += [*entrainment.quiet(v), *samples.repeated(v)]
+        flags += [*entrainment.quiet(v), *samples.repeated(v), *samples.lost_in_one(v)]
         if v.run.kind != "free":
             flags += samples.phase_steps(v, ["drive"])
     good = _kept(good, flags)

@@ -19,6 +19,7 @@ FloatArray = npt.NDArray[np.float64]
 SIDE = 3  # periods averaged on either side of a step
 STEP_SIGMAS = 10.0
 STEP_SAMPLES = 0.4  # smallest step, in samples' worth of phase
+LONE = 0.3  # of a step of one channel against the other that any step elsewhere may have
 BLOCK = 16  # samples that are equal elsewhere only when a buffer came twice
 HELD = 3  # equal samples in a row while the signal must have moved
 MANY_HELD = 20
@@ -36,30 +37,61 @@ def recorded_gaps(view: View) -> list[QualityFlag]:
 
 def phase_steps(view: View, names: Sequence[str]) -> list[QualityFlag]:
     """Sudden steps of a channel's phase; the channels' largest is named, with its instant."""
-    per_sample = 2 * np.pi * view.frequency_hz / view.run.sample_rate_hz
     largest: tuple[float, str, float] | None = None
     for name in names:
         phase, times = period_phases(view, name)
-        if phase.size < 4 * SIDE:
-            continue
-        steps = step_heights(phase)
-        steps = steps - np.median(steps)
-        sigma = 1.4826 * float(np.median(np.abs(steps)))
-        at = int(np.argmax(np.abs(steps)))
-        height = float(steps[at])
-        if abs(height) <= max(STEP_SIGMAS * sigma, STEP_SAMPLES * per_sample):
-            continue
-        if largest is None or abs(height) > abs(largest[0]):
-            largest = (height, name, float(times[at + SIDE]))
-    if largest is None:
+        found = largest_step(view, phase)
+        if found is not None and (largest is None or abs(found[0]) > abs(largest[0])):
+            largest = (found[0], name, float(times[found[1] + SIDE]))
+    return [] if largest is None else [_lost(view, *largest)]
+
+
+def lost_in_one(view: View) -> list[QualityFlag]:
+    """One sudden step of one pressure channel's phase against the other's, which samples lost in it
+    alone make. What beats moves both, to and fro."""
+    if len(view.inputs) != 2:
         return []
-    height, name, when = largest
+    (first, times), (second, _) = (period_phases(view, name) for name in view.inputs)
+    if first.size != second.size:
+        return []
+    found = largest_step(view, second - first)
+    if found is None:
+        return []
+    height, at = found
+    steps = np.abs(step_heights(second - first))
+    others = np.delete(steps, np.s_[max(at - 2 * SIDE, 0) : at + 2 * SIDE + 1])
+    if others.size == 0 or others.max() > LONE * abs(height):
+        return []
+    own = [float(step_heights(phase)[at]) for phase in (first, second)]
+    moved = int(np.argmax(np.abs(own)))
+    return [_lost(view, own[moved], view.inputs[moved], float(times[at + SIDE]))]
+
+
+def largest_step(view: View, phase: FloatArray) -> tuple[float, int] | None:
+    """Height (rad) and place of the largest step of a phase, if it is none of the noise's and makes
+    up STEP_SAMPLES of a sample."""
+    if phase.size < 4 * SIDE:
+        return None
+    steps = step_heights(phase)
+    steps = steps - np.median(steps)
+    sigma = 1.4826 * float(np.median(np.abs(steps)))
+    at = int(np.argmax(np.abs(steps)))
+    if abs(steps[at]) <= max(STEP_SIGMAS * sigma, STEP_SAMPLES * _per_sample(view)):
+        return None
+    return float(steps[at]), at
+
+
+def _per_sample(view: View) -> float:
+    return 2 * np.pi * view.frequency_hz / view.run.sample_rate_hz
+
+
+def _lost(view: View, height: float, name: str, when: float) -> QualityFlag:
     detail = (
         f"{name}: the phase steps by {height:+.3g} rad at {when:.3f} s, as if "
-        f"{abs(height) / per_sample:.1f} samples (or whole periods besides) were "
+        f"{abs(height) / _per_sample(view):.1f} samples (or whole periods besides) were "
         f"{'lost' if height > 0 else 'inserted'}; check the buffers, record again"
     )
-    return [finding(view.name, "dropped_samples", "excluded", detail)]
+    return finding(view.name, "dropped_samples", "excluded", detail)
 
 
 def period_phases(view: View, name: str) -> tuple[FloatArray, FloatArray]:
