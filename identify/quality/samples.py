@@ -54,11 +54,12 @@ def lost_in_one(view: View) -> list[QualityFlag]:
     (first, times), (second, _) = (period_phases(view, name) for name in view.inputs)
     if first.size != second.size:
         return []
-    found = largest_step(view, second - first)
+    apart = np.unwrap(second - first)  # a whole turn of either alone is noise, where it is weak
+    found = largest_step(view, apart)
     if found is None:
         return []
     height, at = found
-    steps = np.abs(step_heights(second - first))
+    steps = np.abs(step_heights(apart))
     others = np.delete(steps, np.s_[max(at - 2 * SIDE, 0) : at + 2 * SIDE + 1])
     if others.size == 0 or others.max() > LONE * abs(height):
         return []
