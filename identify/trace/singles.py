@@ -14,7 +14,7 @@ from identify.trace.exchange import in_other_forms
 from identify.trace.scores import ScoreTest, score_tests
 from identify.trace.stages import started_again, try_effects
 from identify.trace.to_the_end import led_on
-from identify.trace.tried import Tried, astray, misfit
+from identify.trace.tried import Tried, misfit
 
 #: What an effect leaves at another minimum of the declared model, at most, over what the best does,
 #: by the tangents there, if it is tried there.
@@ -31,12 +31,13 @@ class Alone:
     available: tuple[Effect, ...]
     scores: Mapping[str, ScoreTest] | None
     minima: tuple[Fit, ...]  # others of the declared model
+    far: bool  # whether the declared fit is no place to start from
 
 
 def try_alone(work: Alone, run: Executor, report: Progress) -> list[Tried]:
     """Every effect by itself; the best of them in their other forms too."""
     data, base, available = work.data, work.base, work.available
-    far = astray(base)
+    far = work.far
     apart = [e for e in available if not e.refines]
     singles = try_effects(
         work.structure, data, base, apart, executor=run, keep=8,

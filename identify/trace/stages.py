@@ -497,11 +497,13 @@ def _heats(
 
 
 def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float, ...], ...]:
-    """Positions of the other modes (over the free frequency) of the best coarse starts."""
+    """Positions of the other modes (over the free frequency) of the best coarse starts: the best
+    two of one mode; of several, which trade off each other at coarse noise, all."""
     if structure.mode_count == 1:
         return ((),)
     out: list[tuple[float, ...]] = []
-    for start in physical_starts(structure, data)[:20]:
+    starts = physical_starts(structure, data)
+    for start in starts[:20] if structure.mode_count == 2 else starts:
         values = structure.parameters.plain(start.theta)
         ratio = tuple(
             round(values[f"mode{i}.frequency_hz"] / data.free_hz, 6)
@@ -509,7 +511,7 @@ def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float,
         )
         if ratio not in out:
             out.append(ratio)
-    return tuple(out[:2])
+    return tuple(out[:2] if structure.mode_count == 2 else out)
 
 
 def try_scatters(
