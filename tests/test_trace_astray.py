@@ -622,3 +622,25 @@ def test_a_diagnosis_that_runs_out_of_time_says_so(tmp_path: Path) -> None:
     assert found.verdict == "unexplained"
     assert "Not all was tried within 0.001 s" in found.explanation
     assert found.whereabouts is not None
+
+
+def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Path) -> None:
+    """The declared fit leaves 70 times the noise, and two coalesced modes have taken up what the
+    distortion makes: it leads nowhere. Of the placements of two further modes the right one comes
+    fourth at coarse noise (59285)."""
+    a2 = -0.0099134
+    rig = random_rig(59285, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    distorted = make_effect("actuator_nonlinearity/distortion", {"quadratic_per_v": a2})
+    ready = record(tmp_path, 59285, rig, [distorted], forced=10, validation=3, modes=3)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert 10 < base.chi2_per_dof < 100
+    quadratic = by_key("actuator_nonlinearity:quadratic")
+    going = replace(searching(base, available=(quadratic,)), data=ready.data)
+    going.alone(None)
+    assert not going.explained
+    going.each_alone(None)
+    (found,) = {t.key for t in going.tried if t.explains}
+    assert found == ("actuator_nonlinearity",)
+    best = min((t for t in going.tried if t.explains), key=lambda t: t.fit.chi2)
+    known = best.estimates["actuator_nonlinearity.a2"]
+    assert known.value == pytest.approx(a2, abs=4 * known.stderr)
