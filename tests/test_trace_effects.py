@@ -572,6 +572,11 @@ def test_a_claim_takes_most_of_the_misfit_away(
     # nor what predicts the held-out runs worse than a part of it does
     worse = replace(both, validation_error=1.5e-3)
     assert not trace.accounts(worse, gross, [skew, worse])
+    # unless those runs speak against that part, by their noise, and not against the whole (59024)
+    against = replace(skew, validation_p=0.002)
+    assert trace.accounts(worse, gross, [against, worse]) is accounted
+    doubtful = replace(worse, validation_p=0.01)
+    assert not trace.accounts(doubtful, gross, [against, doubtful])
     # a little worse may be noise's doing, unless the chance of it says otherwise
     little = replace(both, validation_error=1.1e-3)
     assert trace.accounts(little, gross, [skew, little]) is accounted

@@ -177,7 +177,11 @@ def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:
 
 def _predicts_worse(t: Tried, o: Tried) -> bool:
     """Whether `t` predicts the held-out runs worse than `o`: much, or a little and hardly by chance
-    either. Near the noise a few runs decide nothing (44014)."""
+    either. Near the noise a few runs decide nothing (44014). Not where these runs, each coefficient
+    against its own noise, speak against `o` and not against `t`: the error is mostly that of the
+    largest coefficients (59024)."""
+    if o.validation_p < WORSE_P <= t.validation_p:
+        return False
     more = t.validation_error / o.validation_error
     return more > WORSE or (more > 1.0 and t.validation_p < min(WORSE_P, o.validation_p))
 
