@@ -123,6 +123,12 @@ def test_live_view_and_escape_stops(page: Any, server: Running) -> None:
         client.post("/rigs/quick/reset")
 
 
+def test_a_rig_that_is_not_there_is_not_live(page: Any, server: Running) -> None:
+    go(page, server, "live/nobody", "text=No rig is called nobody.")
+    page.click("p >> text=quick")
+    page.wait_for_selector("text=Live: quick")
+
+
 def test_the_fit_that_goes_with_a_campaign_is_shown(page: Any, server: Running) -> None:
     plan = {
         "record_s": 0.5,

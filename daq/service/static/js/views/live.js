@@ -13,6 +13,10 @@ export default async function live([wanted]) {
   const running = list.find((rig) => rig.state === "running");
   const name = wanted || running?.name || list[0]?.name;
   if (!name) return { title: "Live", content: h("p", {}, "No rig is configured. Add a simulated one under Rigs.") };
+  if (!list.some((rig) => rig.name === name)) {
+    const others = list.flatMap((rig, i) => [i ? ", " : "", h("a", { href: `#live/${rig.name}` }, rig.name)]);
+    return { title: "Live", content: h("p", {}, `No rig is called ${name}. `, list.length ? "There is " : "Add one under Rigs.", ...others) };
+  }
 
   const picker = h("select", { "aria-label": "Rig", onchange: (e) => { location.hash = `live/${e.target.value}`; } },
     list.map((rig) => h("option", { value: rig.name, selected: rig.name === name }, rig.name)));
