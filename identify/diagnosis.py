@@ -42,6 +42,7 @@ REFITTED = 6  # sets of effects that are fitted again where the data's covarianc
 FEW = 2  # numbers that a law may have without asking whether it stands for one run alone
 ALONE = "the declared model explains all runs but this one; record it again"
 DOUBTFUL = 0.05  # probability of a claim's lack of fit below which free shapes contest it
+SLIGHT = 10.0  # χ²/dof of the declared model below which they contest every claim
 
 
 @one_thread
@@ -145,7 +146,7 @@ def diagnose(
 
     contesting: list[Tried] = []
     verdict, chosen, explanation = _judge(declared, tried, data)
-    if chosen is not None and (chosen.fit_p < DOUBTFUL or chosen.spread or len(chosen.effects) > 1):
+    if chosen is not None and _asks_for_shapes(chosen, base):
         # a spread takes up much, and so may laws: not where one does better that nobody knows
         tried = trace.against_chance(tried, pieces())
         contesting = deviating(chosen) if chosen.spread else []
@@ -397,6 +398,15 @@ def _judge(
     else:
         said = "No known effect explains the data to within noise."
     return "unexplained", chosen, said + left
+
+
+def _asks_for_shapes(chosen: Tried, base: Fit) -> bool:
+    """Whether freely shaped pieces contest a claim: where it hardly comes to the noise, where a
+    spread or several laws may take up much that is not theirs, and where so little was missing from
+    the declared fit `base` that many laws follow it (48030)."""
+    if chosen.spread is not None or len(chosen.effects) > 1:
+        return True
+    return chosen.fit_p < DOUBTFUL or base.chi2_per_dof < SLIGHT
 
 
 def _nearly(
