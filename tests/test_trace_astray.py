@@ -644,3 +644,20 @@ def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Pat
     best = min((t for t in going.tried if t.explains), key=lambda t: t.fit.chi2)
     known = best.estimates["actuator_nonlinearity.a2"]
     assert known.value == pytest.approx(a2, abs=4 * known.stderr)
+
+
+def test_many_laws_follow_what_is_slight(tmp_path: Path) -> None:
+    """A second time scale of the flame that no candidate names, at 1.9 times the noise: a loss comes
+    to the noise, and a free shape in the flame is far likelier (48030)."""
+    rig = random_rig(48030, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    slow = {"slow_share": 0.0467, "slow_pole_hz": 54.866}
+    effect = make_effect("flame_dynamics/second_time_scale", slow)
+    ready = record(tmp_path, 48030, rig, [effect], forced=7, validation=2)
+    loss = by_key("nonlinear_damping:quadratic_end")
+    found = identify.diagnose(ready.campaign, catalogue=[loss])
+    assert found.before.chi2_per_dof < 3
+    assert any(c.adequate for c in found.candidates)
+    assert found.verdict == "unexplained"
+    assert "far less likely" in found.explanation
+    assert found.whereabouts is not None
+    assert "flame" in found.whereabouts.likely
