@@ -647,8 +647,8 @@ def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Pat
 
 
 def test_many_laws_follow_what_is_slight(tmp_path: Path) -> None:
-    """A second time scale of the flame that no candidate names, at 1.9 times the noise: a loss comes
-    to the noise, and a free shape in the flame is far likelier (48030)."""
+    """A second time scale of the flame, which no candidate names, leaves 1.9 times the noise: a
+    loss comes to the noise, and a free shape of the flame is far likelier (48030)."""
     rig = random_rig(48030, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
     slow = {"slow_share": 0.0467, "slow_pole_hz": 54.866}
     effect = make_effect("flame_dynamics/second_time_scale", slow)
