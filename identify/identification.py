@@ -77,8 +77,9 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
     chosen = structure or declared_structure(campaign.declared_model)
     found = quality.inspect(campaign)
     tones = {t.frequency_hz: t.amplitude for t in found.tones}
+    doubted = found.doubted
     measured = [
-        h.doubted(DOUBT, found.doubted[h.name]) if h.name in found.doubted else h
+        h.doubted(DOUBT, doubted[h.name]) if h.name in doubted else h
         for h in harmonics.measure_campaign(campaign, skip=sorted(found.excluded), tones=tones)
     ]
     if not any(h.kind == "forced" and h.role == "fit" for h in measured):

@@ -171,6 +171,11 @@ def bias(side: float, own: float) -> float:
     return 2 * (side / own) ** 2
 
 
+def worst_bias(side: float, own: float) -> float:
+    """The same of a response near a resonance, which answers so much more."""
+    return AMPLIFIED * bias(side, own)
+
+
 def entrainment(view: View, free: FreeLine | None) -> list[QualityFlag]:
     """`not_entrained`, `incompletely_entrained`, or nothing, of a forced run."""
     if view.run.kind != "forced":
@@ -197,6 +202,6 @@ def entrainment(view: View, free: FreeLine | None) -> list[QualityFlag]:
     error = bias(side.level, own)
     if error > WORTH_NOTING:
         detail = f"{where}: biases the coefficients by about {error:.1e}; raise the drive or wait"
-        worst = AMPLIFIED * error
+        worst = worst_bias(side.level, own)
         return [finding(view.name, "incompletely_entrained", "down_weighted", detail, error=worst)]
     return []

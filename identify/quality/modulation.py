@@ -9,7 +9,7 @@ channels has no such images.
 import numpy as np
 import numpy.typing as npt
 
-from identify.quality.entrainment import AMPLIFIED, PURE, SIGNIFICANT, FreeLine, bias
+from identify.quality.entrainment import PURE, SIGNIFICANT, FreeLine, bias, worst_bias
 from identify.quality.findings import Severity, decibel, finding
 from identify.quality.lines import lines, peaks
 from identify.quality.spectrum import local_noise, purity
@@ -51,7 +51,7 @@ def quasi_periodic(view: View) -> list[QualityFlag]:
         f"{decibel(size / own):.1f} dB re the run's own: modulated, biased by about "
         f"{bias(size, own):.1e}; look for a second oscillation or hum on the generator"
     )
-    worst = AMPLIFIED * bias(size, own)
+    worst = worst_bias(size, own)
     return [finding(view.name, "quasi_periodic", severity, detail, error=worst)]
 
 
@@ -79,7 +79,7 @@ def another_oscillation(view: View, free: FreeLine | None) -> list[QualityFlag]:
         f"combinations at {', '.join(f'{g:.1f}' for g in seen)} Hz: another mode sings beside the "
         "forcing; lower the drive or force elsewhere"
     )
-    worst = AMPLIFIED * bias(level, 1.0)
+    worst = worst_bias(level, 1.0)
     return [finding(view.name, "another_oscillation", severity, detail, error=worst)]
 
 
