@@ -497,21 +497,18 @@ def _heats(
 
 
 def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float, ...], ...]:
-    """Positions of the other modes (over the free frequency) of the best coarse starts: the best
-    two of one mode; of several, which trade off each other at coarse noise, all."""
-    if structure.mode_count == 1:
-        return ((),)
+    """Positions of the other mode (over the free frequency) of the best two coarse starts. Where
+    there is none, or there are several, which trade off each other at coarse noise: none, for all
+    that the slow flow starts from."""
+    if structure.mode_count != 2:
+        return ()
     out: list[tuple[float, ...]] = []
-    starts = physical_starts(structure, data)
-    for start in starts[:20] if structure.mode_count == 2 else starts:
-        values = structure.parameters.plain(start.theta)
-        ratio = tuple(
-            round(values[f"mode{i}.frequency_hz"] / data.free_hz, 6)
-            for i in range(2, structure.mode_count + 1)
-        )
+    for start in physical_starts(structure, data)[:20]:
+        other_hz = structure.parameters.plain(start.theta)["mode2.frequency_hz"]
+        ratio = (round(other_hz / data.free_hz, 6),)
         if ratio not in out:
             out.append(ratio)
-    return tuple(out[:2] if structure.mode_count == 2 else out)
+    return tuple(out[:2])
 
 
 def try_scatters(
