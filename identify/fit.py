@@ -629,6 +629,20 @@ def covariance_of(jacobian: FloatArray) -> FloatArray:
     return np.asarray(((Vt.T * (1.0 / sv**2)) @ Vt) / np.outer(norm, norm))
 
 
+def resolved(structure: Structure, theta: FloatArray, covariance: FloatArray) -> FloatArray:
+    """The covariance of θ's unknowns, with what the tangents do not say (`Effect.resolution`)."""
+    parameters = structure.parameters
+    values, slopes = parameters.plain(theta), parameters.slopes(theta)
+    out = covariance
+    for effect in structure.effects:
+        for name, stderr in effect.resolution(values).items():
+            i = parameters.index[name]
+            out = out.copy()
+            out[i], out[:, i] = 0.0, 0.0
+            out[i, i] = (stderr / slopes[i]) ** 2
+    return out
+
+
 def log_determinant_of(jacobian: FloatArray) -> float:
     """ln det JᵀJ: minus that of `covariance_of`, which need not be formed for it."""
     norm, sv, _ = _scaled(jacobian)
@@ -738,7 +752,7 @@ def _from_each(
         theta,
         best.cost,
         dof,
-        covariance_of(jacobian),
+        resolved(structure, theta, covariance_of(jacobian)),
         best.residual,
         jacobian,
         best.converged,

@@ -265,6 +265,19 @@ class Effect:
         which are tested at one shape after the other. Empty where `neutral` says it all."""
         return []
 
+    def among(self, fitted: Sequence[float], held_out: Sequence[float]) -> "Effect":
+        """The effect for a campaign whose runs are at these `Conditions.time`."""
+        return self
+
+    def as_well(self, values: Mapping[str, float]) -> list[dict[str, float]]:
+        """Values of its own that the fitted runs do not tell apart; the held-out ones may."""
+        return []
+
+    def resolution(self, values: Mapping[str, float]) -> dict[str, float]:
+        """Standard deviations of those parameters of which the runs say no more than between which
+        of them a value lies, with no tangent: by name."""
+        return {}
+
     def to_internal(self, values: Sequence[float]) -> FloatArray:
         """Unknowns of the effect's own parameters from their physical values."""
         return ParameterSet(self.parameters).to_internal(values)

@@ -24,7 +24,11 @@ KNOWN = Known(
     (160.0, 900.0), 8,
 )  # fmt: skip
 PLACES = ("forward", "flame", "actuator", "experiment")
-LINEAR = [e for e in CATALOGUE if e.location in PLACES and e.mode_count in (None, 2)]
+LINEAR = [
+    e.among(np.linspace(0.0, 1.0, 8), ())
+    for e in CATALOGUE
+    if e.location in PLACES and e.mode_count in (None, 2)
+]
 IRRATIONAL = "flame_dynamics:distributed_delay"
 STRUCTURES = {
     "declared": Structure(),

@@ -15,6 +15,7 @@ from daq.importers import open_campaign
 from identify import diagnosis, dual, profile, start, trace
 from identify.dataset import Dataset
 from identify.effects import CATALOGUE, by_key
+from identify.effects.experiment import Step
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import OrbitResidual, soften
@@ -35,7 +36,8 @@ from simulated_rig.campaigns import (
     simulate_run,
     write_campaign,
 )
-from simulated_rig.config import RigConfig
+from simulated_rig.config import Drift, RigConfig
+from simulated_rig.drift import drifted
 from simulated_rig.effects import make_effect
 from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign, random_rig
@@ -142,6 +144,125 @@ def test_drifts_of_one_thing_alone(
     for name, value in truth.items():
         found = best.estimates[f"parameter_drift.{name}"]
         assert abs(found.value - value) < 4 * found.stderr
+
+
+ONCE, PERIOD = 0.45, 0.8  # of the campaign: when a knob is turned, and how long a cycle takes
+COURSES = {
+    "step": (lambda t: CHANGE * (t > ONCE), {"relative_change": CHANGE}),
+    "cycle": (
+        lambda t: CHANGE * np.sin(2 * np.pi * t / PERIOD),
+        {"sine": CHANGE, "cosine": 0.0, "period": PERIOD},
+    ),
+}
+
+
+@pytest.mark.parametrize("course", COURSES)
+@pytest.mark.parametrize("what", ["frequency", "flame_gain", "damping", "speaker_gain"])
+def test_what_changes_at_once_or_to_and_fro(tmp_path: Path, what: str, course: str) -> None:
+    """Without these forms a step of the flame's gain was claimed as its random modulation, and one
+    of the speaker's as a drive that scatters."""
+    moved, truth = COURSES[course]
+    share = 0.1 if what == "frequency" else 1.0
+
+    def change(plant: Plant, t: float) -> Plant:
+        return drifted(plant, [Drift(what, share * moved(t), 1.0)], 1.0)
+
+    ready = changing(tmp_path, change)
+    forms = [e for e in CATALOGUE if e.name == "parameter_drift" and e.form.startswith(what)]
+    found = identify.diagnose(ready.campaign, catalogue=[*forms, *SCATTERS])
+    assert found.verdict == "traced"
+    (effect,) = found.effects
+    assert (effect.effect, effect.form) == ("parameter_drift", f"{what}_{course}")
+    for name, value in truth.items():
+        size = value if name == "period" else share * value
+        e = effect.parameters[f"parameter_drift.{name}"]
+        assert abs(e.value - size) < 4 * e.stderr
+    if course == "step":  # between the runs on either side, anywhere
+        when = effect.parameters["parameter_drift.step_time"]
+        assert abs(when.value - ONCE) < 1.8 * when.stderr < 0.3
+
+
+def test_held_out_runs_tell_on_which_side_of_a_step_they_lie() -> None:
+    fitted_at, between = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8), {"parameter_drift.step_time": 0.3}
+    assert Step("damping").between == []  # of which runs?
+    alone = Step("damping", fitted_at)
+    assert alone.between == pytest.approx([0.15, 0.3, 0.5])
+    assert alone.as_well(between) == [pytest.approx(between)]
+    assert alone.resolution(between) == pytest.approx({"parameter_drift.step_time": 0.2 / 12**0.5})
+    beside_one = Step("damping", fitted_at, (0.3, 0.9))
+    found = [row["parameter_drift.step_time"] for row in beside_one.as_well(between)]
+    assert found == pytest.approx([0.25, 0.35])
+    now = {"parameter_drift.step_time": 0.25}
+    assert beside_one.resolution(now) == pytest.approx({"parameter_drift.step_time": 0.1 / 12**0.5})
+
+
+def test_an_amplifier_of_unequal_halves(tmp_path: Path) -> None:
+    """u + a|u|: without it, a polynomial beside another mode."""
+    a = 0.02
+
+    def amplified(run: RecordedRun) -> RecordedRun:
+        return replace(run, drive=run.drive / np.where(run.drive > 0, 1 + a, 1 - a))
+
+    ready = altered_campaign(tmp_path, 7, amplified)
+    forms = [e for e in CATALOGUE if e.name == "actuator_nonlinearity"]
+    found = identify.diagnose(ready.campaign, catalogue=[*forms, by_key("acoustic_mode:mode")])
+    assert (found.verdict, [e.form for e in found.effects]) == ("traced", ["unequal_halves"])
+    size = found.effects[0].parameters["actuator_nonlinearity.asymmetry"]
+    assert abs(size.value - a) < 4 * size.stderr < a
+
+
+def test_a_notch_of_the_speaker(tmp_path: Path) -> None:
+    hz, damping, peak = 185.0, 0.15, -0.45
+
+    def notched(run: RecordedRun) -> RecordedRun:
+        s = 1j * np.fft.rfftfreq(run.drive.size, 1 / 10000.0) / hz
+        lost = 2 * damping * s
+        given = np.fft.rfft(run.drive) * (s**2 + lost + 1) / (s**2 + lost * (1 + peak) + 1)
+        return replace(run, drive=np.fft.irfft(given, run.drive.size))
+
+    ready = altered_campaign(tmp_path, 7, notched)
+    forms = [e for e in CATALOGUE if e.name == "actuator_dynamics"]
+    found = identify.diagnose(ready.campaign, catalogue=forms)
+    assert (found.verdict, [e.form for e in found.effects]) == ("traced", ["peak"])
+    for name, value in (("frequency_hz", hz), ("damping", damping), ("peak", peak)):
+        e = found.effects[0].parameters[f"actuator_dynamics.{name}"]
+        assert abs(e.value - value) < 4 * e.stderr < 0.2 * abs(value)
+
+
+def test_a_sensitivity_that_drifts(tmp_path: Path) -> None:
+    """Of one microphone of two."""
+    change, last = 0.01, max(run.started_s for run in planned()[1])
+
+    def heard(run: RecordedRun) -> RecordedRun:
+        return replace(run, p2=run.p2 * (1 + change * run.plan.started_s / last))
+
+    ready = altered_campaign(tmp_path, 7, heard)
+    forms = [e for e in CATALOGUE if e.name in ("parameter_drift", "channel_mismatch")]
+    found = identify.diagnose(ready.campaign, catalogue=forms)
+    assert (found.verdict, [e.form for e in found.effects]) == ("traced", ["channel_gain"])
+    e = found.effects[0].parameters["parameter_drift.relative_change"]
+    assert abs(e.value - change) < 4 * e.stderr < 0.1 * change
+
+
+@pytest.mark.parametrize("upper", [True, False])
+def test_a_microphone_with_a_resonance(tmp_path: Path, upper: bool) -> None:
+    """Without it, gain and skew of the channel beside two effects elsewhere."""
+    hz, damping = 2000.0, 0.3
+
+    def heard(run: RecordedRun) -> RecordedRun:
+        p = run.p2 if upper else run.p1
+        s = 1j * np.fft.rfftfreq(p.size, 1 / 10000.0) / hz
+        p = np.fft.irfft(np.fft.rfft(p) / (1 + 2 * damping * s + s**2), p.size)
+        return replace(run, p2=p) if upper else replace(run, p1=p)
+
+    ready = altered_campaign(tmp_path, 7, heard)
+    forms = [e for e in CATALOGUE if e.location == "sensor"]
+    found = identify.diagnose(ready.campaign, catalogue=[*forms, by_key("actuator_dynamics:pole")])
+    side = "upper" if upper else "lower"
+    assert (found.verdict, [e.form for e in found.effects]) == ("traced", [f"{side}_resonance"])
+    for name, value in (("frequency_hz", hz), ("damping", damping)):
+        e = found.effects[0].parameters[f"channel_mismatch.{name}"]
+        assert abs(e.value - value) < 4 * e.stderr < 0.2 * value
 
 
 def test_a_spread_must_leave_nothing_but_noise(

@@ -97,6 +97,37 @@ class LaggingResonance(Effect):
         return self.resonance.actuator(p, at, s) * self.lag.actuator(p, at, s)
 
 
+class SpeakerPeak(Effect):
+    """A peak or a notch that the speaker's enclosure adds to an even response:
+    (s² + 2ζ(1 + g)ωs + ω²)/(s² + 2ζωs + ω²), 1 + g the response at ω."""
+
+    name, location, form = "actuator_dynamics", "actuator", "peak"
+    parameters = (
+        Parameter("actuator_dynamics.peak", "1", -1.0, 50.0, scale=1e-2),
+        *SpeakerResonance.parameters,
+    )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        sizes = (0.5, -0.5)
+        return [(size, f, z) for size in sizes for _, f, z in self.shapes(known)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        if other.form != "resonance":
+            return []
+        f, z = (values[q.name] for q in other.parameters)
+        return [(0.5, f, z), (-0.5, f, z)]
+
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        places = (0.7, 0.95, 1.05, 1.4, 1.9, 2.1, 2.7, 3.1)
+        return [(0.0, q * known.free_hz, z) for q in places for z in (0.05, 0.2)]
+
+    def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
+        w = 2 * np.pi * p["actuator_dynamics.frequency_hz"]
+        lost = 2.0 * p["actuator_dynamics.damping"] * w * s
+        even = s * s + w * w
+        return (even + lost * (p["actuator_dynamics.peak"] + 1.0)) / (even + lost)
+
+
 class ActuatorDelay(Effect):
     """A delay between the recorded drive and the sound.
 
@@ -263,6 +294,25 @@ class Crossover(Effect):
         return Bent(left, np.where(passed, 1.0, 0.0), ((lambda: -np.sign(v) * passed, given),))
 
 
+class UnequalHalves(Effect):
+    """An amplifier of two halves, or a speaker, whose gain is not the same for either sign of the
+    drive: u + a |u|."""
+
+    name, location, form = "actuator_nonlinearity", "actuator", "unequal_halves"
+    parameters = (Parameter("actuator_nonlinearity.asymmetry", "1", -0.5, 0.5, scale=1e-2),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.02,), (-0.02,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def amplifier(self, p: Values, v: FloatArray) -> Bent:
+        given = p["actuator_nonlinearity.asymmetry"]
+        share, size = dual.value(given), np.abs(v)
+        return Bent(v + share * size, 1.0 + share * np.sign(v), ((lambda: size, given),))
+
+
 class Knee(Effect):
     """An amplifier near its rails: u / (1 + |u/L|ⁿ)^(1/n), linear below L, ± L above.
 
@@ -305,6 +355,7 @@ EFFECTS: tuple[Effect, ...] = (
     VoiceCoil(),
     Coupling(),
     LaggingResonance(),
+    SpeakerPeak(),
     ActuatorDelay(),
     Distortion((2,)),
     Distortion((3,)),
@@ -315,5 +366,6 @@ EFFECTS: tuple[Effect, ...] = (
     HardClipping(),
     UnequalClipping(),
     Crossover(),
+    UnequalHalves(),
     Knee(),
 )

@@ -1,14 +1,22 @@
 """The experiment: parameters that change in the course of a campaign."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from identify import dual
+from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Mode, Values
+from identify.structure import Conditions, Effect, Known, Mode, Structure, Values
+
+FloatArray = npt.NDArray[np.float64]
 
 FIRST = {"first_mode": "frequency", "first_damping": "damping"}  # what changes of mode 1 alone
+ONE_BY_ONE = ("frequency", "flame_gain", "damping", "speaker_gain")
+EACH_SIDE = 2  # runs at least, before and after a step: one alone is no evidence of a course
 
 
 def course(at: Conditions, change: Any, curvature: Any = None) -> Any:
@@ -26,6 +34,11 @@ def settling(at: Conditions, change: Any, time: Any) -> Any:
     return (1.0 - dual.exp(-(at.time[:, None] / time))) * change + 1.0
 
 
+def step(at: Conditions, change: Any, when: Any) -> Any:
+    """The same at once, at `when`; runs do not tell when between two of them, so no derivative."""
+    return change * (at.time[:, None] > dual.value(when)) + 1.0
+
+
 def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
     """The modes with one thing of theirs multiplied."""
     if what == "frequency":
@@ -41,7 +54,7 @@ def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
 
 class Drift(Effect):
     """A relative change over the campaign, linear in time; ``_curve``: and quadratic;
-    ``_settling``: towards a last value, as what warms up does.
+    ``_settling``: towards a last value, as what warms up does; at once, `Step`.
 
     ``frequency``: all modal frequencies together, as temperature does; ``flame_gain``: the fuel;
     ``damping``; ``speaker_gain``: a warming voice coil; ``first_mode`` and ``first_damping``: mode
@@ -60,7 +73,7 @@ class Drift(Effect):
             Parameter(f"parameter_drift.{n}", "1", -0.8, 0.8, scale=scale)
             for n in ("relative_change", "curvature")
         )
-        time = Parameter("parameter_drift.settling_time", "1", 0.15, 5.0, "positive")
+        time = Parameter("parameter_drift.settling_time", "1", 0.04, 5.0, "positive")
         more = (curvature,) if self.curved else (time,) if self.settles else ()
         self.parameters = (change, *more)
 
@@ -73,7 +86,7 @@ class Drift(Effect):
         return None if self.settles else (0.0,) * len(self.parameters)
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
-        return [(0.0, q) for q in (0.17, 0.3, 0.6)] if self.settles else []
+        return [(0.0, q) for q in (0.06, 0.1, 0.17, 0.3, 0.6)] if self.settles else []
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         change = p["parameter_drift.relative_change"]
@@ -82,6 +95,107 @@ class Drift(Effect):
         else:
             curvature = p["parameter_drift.curvature"] if self.curved else None
             factor = course(at, change, curvature)
+        return changed(modes, self.what, factor)
+
+
+class Step(Effect):
+    """A relative change at once, as where a valve or a knob was turned between two runs.
+
+    Of what, as in `Drift`. It lies between two of the runs at `times`, those that are fitted and
+    those that are not, with `EACH_SIDE` of the `fitted` before and after; without them is none.
+    """
+
+    name, location = "parameter_drift", "experiment"
+    when = Parameter("parameter_drift.step_time", "1", 0.0, 1.0)
+
+    def __init__(
+        self, what: str, fitted: Sequence[float] = (), held_out: Sequence[float] = ()
+    ) -> None:
+        self.what, self.form = what, f"{what}_step"
+        self.fitted, self.times = np.unique(fitted), np.unique([*fitted, *held_out])
+        self.parameters = (Drift(what).parameters[0], self.when)
+
+    def among(self, fitted: Sequence[float], held_out: Sequence[float]) -> Effect:
+        return Step(self.what, fitted, held_out)
+
+    def extends(self, structure: Structure) -> bool:
+        return len(self.between) > 0
+
+    @property
+    def between(self) -> list[float]:
+        """When it may have been: half-way between two fitted runs."""
+        middles = (self.fitted[:-1] + self.fitted[1:]) / 2
+        return [float(t) for t in middles[EACH_SIDE - 1 : middles.size - EACH_SIDE + 1]]
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        size = self.parameters[0].scale
+        return [(q * size, t) for q in (5.0, -5.0) for t in self.between]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        change = values.get(self.parameters[0].name, 0.0)
+        known = values.get(self.when.name)
+        return [(change, t) for t in (self.between if known is None else [known])]
+
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0, t) for t in self.between]
+
+    def as_well(self, values: Mapping[str, float]) -> list[dict[str, float]]:
+        before, after = _next_to(self.fitted, values[self.when.name])
+        inside = self.times[(self.times >= before) & (self.times <= after)]
+        return [{self.when.name: float(t)} for t in (inside[:-1] + inside[1:]) / 2]
+
+    def resolution(self, values: Mapping[str, float]) -> dict[str, float]:
+        before, after = _next_to(self.times, values[self.when.name])
+        return {self.when.name: (after - before) / np.sqrt(12.0)}
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        change, when = (p[q.name] for q in self.parameters)
+        return changed(modes, self.what, step(at, change, when))
+
+
+def _next_to(times: FloatArray, when: float) -> tuple[float, float]:
+    """The last of `times` before `when`, and the first after."""
+    after = int(np.clip(np.searchsorted(times, when), 1, times.size - 1))
+    return float(times[after - 1]), float(times[after])
+
+
+class Cycle(Effect):
+    """A relative change to and fro, as where a thermostat or a compressor goes on and off:
+    1 + a sin ωt + b (1 − cos ωt), of what as in `Drift`."""
+
+    name, location = "parameter_drift", "experiment"
+
+    def __init__(self, what: str) -> None:
+        self.what, self.form = what, f"{what}_cycle"
+        scale = Drift(what).parameters[0].scale
+        self.parameters = (
+            Parameter("parameter_drift.sine", "1", -0.8, 0.8, scale=scale),
+            Parameter("parameter_drift.cosine", "1", -0.8, 0.8, scale=scale),
+            Parameter("parameter_drift.period", "1", 0.2, 3.0, "positive"),
+        )
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        size = 5 * self.parameters[0].scale
+        return [
+            (a * size, b * size, period)
+            for *_, period in self.shapes(known)
+            for a, b in ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
+        ]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        names = [q.name for q in self.parameters]
+        if names[-1] in values:
+            return [tuple(values[name] for name in names)]
+        change = values.get("parameter_drift.relative_change", 0.0)
+        return [(change * a, change * b, t) for a, b, t in ((0.6, 0.0, 1.5), (0.0, 0.5, 1.0))]
+
+    def shapes(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.0, 0.0, period) for period in (0.3, 0.4, 0.52, 0.68, 0.9, 1.3, 2.0)]
+
+    def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
+        sine, cosine, period = (p[q.name] for q in self.parameters)
+        turned = 2 * np.pi * at.time[:, None] / period
+        factor = sine * dual.sin(turned) + cosine * (1.0 - dual.cos(turned)) + 1.0
         return changed(modes, self.what, factor)
 
 
@@ -141,6 +255,25 @@ class Warming(Effect):
         return changed(modes, "damping", settling(at, damping, time))
 
 
+class SensorDrift(Effect):
+    """The upper microphone's sensitivity changes over the campaign against the lower one's."""
+
+    name, location, form = "parameter_drift", "experiment", "channel_gain"
+    needs = ("pressure",)
+    parameters = (Parameter("parameter_drift.relative_change", "1", -0.5, 0.5, scale=1e-3),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(0.001,), (-0.001,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        read = course(at, p["parameter_drift.relative_change"])
+        leak = as_velocity(at, s, upper_pressure(at, s))
+        return with_leak(at, y, leak * (1.0 / read - 1.0))
+
+
 class FlameDrift(Effect):
     """The flame's linear answer to the velocity changes over the campaign.
 
@@ -179,10 +312,10 @@ EFFECTS: tuple[Effect, ...] = (
     Drift("damping"),
     Drift("first_damping"),
     Drift("speaker_gain"),
-    Drift("frequency_curve"),
-    Drift("frequency_settling"),
-    Drift("flame_gain_curve"),
-    Drift("flame_gain_settling"),
+    *(Drift(f"{what}_{course}") for what in ONE_BY_ONE for course in ("curve", "settling")),
+    *map(Step, ONE_BY_ONE),
+    *map(Cycle, ONE_BY_ONE),
+    SensorDrift(),
     FlameDrift("flame_input"),
     FlameDrift("flame_pole"),
     FlameDrift("flame_rate"),

@@ -104,6 +104,40 @@ class ChannelMismatch(Effect):
         return with_leak(at, y, leak * (inverse - 1.0))
 
 
+class MicrophoneResonance(Effect):
+    """One microphone's own resonance, of its membrane or of the hole before it: it reads
+    1/(1 + 2ζs/ω + s²/ω²) times the pressure."""
+
+    name, location = "channel_mismatch", "sensor"
+    needs = ("pressure",)
+    parameters = (
+        Parameter("channel_mismatch.frequency_hz", "Hz", 50.0, 1e5, "positive"),
+        Parameter("channel_mismatch.damping", "1", 0.005, 5.0, "positive"),
+    )
+
+    def __init__(self, upper: bool) -> None:
+        self.upper, self.form = upper, "upper_resonance" if upper else "lower_resonance"
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        return [(m * known.free_hz, z) for m in (6.0, 12.0, 30.0) for z in (0.1, 0.6)]
+
+    def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
+        """From a lag T of the upper one: far below its resonance a microphone lags by 2ζ/ω."""
+        if isinstance(other, MicrophoneResonance):
+            return super().starts_from(other, values)
+        known = ("channel_mismatch.skew_s", "channel_mismatch.lowpass_time_s")
+        lag = sum(values.get(name, 0.0) for name in known) * (1 if self.upper else -1)
+        return [(z / (np.pi * lag), z) for z in (0.1, 0.4, 0.8)] if lag > 0 else []
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        w = 2 * np.pi * p[self.parameters[0].name]
+        inverse = (s / w + 2.0 * p[self.parameters[1].name]) * (s / w) + 1.0
+        side = 1.0 if self.upper else -1.0
+        half = s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
+        leak = as_velocity(at, s, side * at.pressure - half)
+        return with_leak(at, y, leak * (inverse - 1.0))
+
+
 class SensorOffset(Effect):
     """The velocity is taken a distance away from the flame.
 
@@ -271,6 +305,8 @@ EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("gain_lowpass"),
     ChannelMismatch("gain_highpass"),
     ChannelMismatch("skew_lowpass"),
+    MicrophoneResonance(upper=True),
+    MicrophoneResonance(upper=False),
     SensorOffset("propagation"),
     SensorOffset("mode_shapes"),
     ModalOffset(2),

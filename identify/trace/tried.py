@@ -6,7 +6,7 @@ only weigh candidates that are adequate already: χ² + p ln n, within 10 of the
 
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -218,11 +218,24 @@ def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
 
 def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
     """A refitted candidate with its adequacy on fitted and held-out runs."""
-    held_out = [assess.predict(fit.structure, fit.theta, b) for b in data.validation]
+    fit, held_out = _foreseen(fit, data)
     error = assess.relative_error(held_out) if held_out else float("nan")
     misfit_out = assess.held_out_misfit(held_out, fit.covariance)
     fit_p, p_out = (assess.lack_of_fit_p(*m) for m in ((fit.chi2, fit.dof), misfit_out))
     return Tried(effects, fit, error, fit_p, p_out, held_out=misfit_out)
+
+
+def _foreseen(fit: Fit, data: Dataset) -> tuple[Fit, list[assess.Prediction]]:
+    """The fit and what it predicts of the held-out runs; where the fitted runs do not tell between
+    several values (`Effect.as_well`), with those that predict best."""
+    parameters, values = fit.structure.parameters, fit.values
+    equal = [now for e in fit.structure.effects for now in e.as_well(values)]
+    rows = [[{**values, **now}[name] for name in parameters.names] for now in equal]
+    fits = [replace(fit, theta=parameters.to_internal(row)) for row in rows]
+    if len(fits) < 2 or not data.validation:
+        fits = [fit]
+    found = [(f, [assess.predict(f.structure, f.theta, b) for b in data.validation]) for f in fits]
+    return min(found, key=lambda item: assess.held_out_misfit(item[1], item[0].covariance)[0])
 
 
 def _width(q: Parameter, value: float) -> float:
