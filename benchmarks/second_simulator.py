@@ -286,14 +286,42 @@ def _resonance(hz: float, zeta: float) -> Callable[[complex], complex]:
     return lambda s: w * w / (s * s + 2 * zeta * w * s + w * w)
 
 
+def _notch(hz: float, zeta: float, peak: float) -> Callable[[complex], complex]:
+    w = TWO_PI * hz
+    return lambda s: 1 + peak * 2 * zeta * w * s / (s * s + 2 * zeta * w * s + w * w)
+
+
+def _heard_through(hz: float, zeta: float) -> Callable[[FloatArray], Any]:
+    return lambda f: 1 / (1 + 2j * zeta * f / hz - (f / hz) ** 2)
+
+
+def _with_play(width: float) -> Callable[[FloatArray], FloatArray]:
+    """What follows one period of a drive with that play either way."""
+
+    def moved(v: FloatArray) -> FloatArray:
+        out, at = np.empty(2 * v.size), 0.0
+        for i, x in enumerate(np.tile(v, 2)):
+            out[i] = at = min(max(at, x - width), x + width)
+        return out[v.size :]
+
+    return moved
+
+
 def _course(
-    name: str, change: float, first: bool = False, settles: float = 0.0, after: float = 0.0
-) -> Any:
+    name: str, change: float, first: bool = False, settles: float = 0.0, after: float = 0.0,
+    period: float = 0.0,
+) -> Any:  # fmt: skip
     """A relative change of one of the tube's numbers (of all modes, or the first), linear, settling
-    exponentially, or at once `after` a share of the campaign."""
+    exponentially, at once `after` a share of the campaign, or to and fro within that `period`."""
 
     def now(tube: Tube, t: float) -> Tube:
-        part = float(t > after) if after else (1 - np.exp(-t / settles)) if settles else t
+        part = t
+        if after:
+            part = float(t > after)
+        elif settles:
+            part = 1 - np.exp(-t / settles)
+        elif period:
+            part = np.sin(TWO_PI * t / period)
         factor = 1 + change * part
         value = getattr(tube, name)
         if isinstance(value, float):
@@ -336,6 +364,8 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "actuator_dynamics/plenum": {
         "speaker": lambda s: _resonance(180, 0.5)(s) / (1 + s / (TWO_PI * 500))
     },
+    "actuator_dynamics/notch": {"speaker": _notch(190, 0.15, -0.3)},
+    "actuator_nonlinearity/unequal_halves": {"drive": lambda v: v + 0.02 * np.abs(v)},
     "actuator_nonlinearity/tanh": {"drive": lambda v: 3 * np.tanh(v / 3)},
     "actuator_nonlinearity/quadratic": {"drive": lambda v: v + 0.05 * v * v},
     "actuator_nonlinearity/cubic": {"drive": lambda v: v - 0.01 * v**3},
@@ -350,6 +380,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
         "upper_microphone": lambda f: 0.985 * np.exp(-2j * np.pi * 12e-6 * f)
     },
     "channel_mismatch/lowpass": {"upper_microphone": lambda f: 1 / (1 + 1j * f / 6000)},
+    "channel_mismatch/resonance": {"upper_microphone": _heard_through(2500, 0.3)},
     "channel_mismatch/highpass": {"upper_microphone": lambda f: 1j * f / (1j * f + 5)},
     "sensor_offset/3cm": {"measured": _offset(-0.03)},
     "sensor_offset/6cm": {"measured": _offset(0.06)},
@@ -361,6 +392,9 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "parameter_drift/flame_input": {"drift": _course("flame_gain", 0.01)},
     "parameter_drift/flame_rate": {"drift": _course("flame_rate", 0.02)},
     "parameter_drift/speaker": {"drift": _course("at_speaker", 0.02)},
+    "parameter_drift/speaker_settling": {"drift": _course("at_speaker", -0.02, settles=0.2)},
+    "parameter_drift/frequency_step": {"drift": _course("frequency_hz", 0.002, after=0.45)},
+    "parameter_drift/damping_cycle": {"drift": _course("damping", 0.05, period=0.8)},
     "flame_gain_modulation": {"modulation": 0.05},
     "drive_scatter/gain": {"drive_scatter": (0.01, 0.0)},
     "drive_scatter/phase": {"drive_scatter": (0.0, 0.02)},
@@ -395,8 +429,12 @@ STRANGERS: dict[str, dict[str, Any]] = {
     "sensor/crosstalk of the drive": {"crosstalk": 0.5},
     "sensor/one microphone compresses": {"microphones": (lambda p: p, _bends(0.003))},
     "sensor/both microphones compress": {"microphones": (_bends(0.01), _bends(0.01))},
-    "experiment/frequency steps": {"drift": _course("frequency_hz", 0.002, after=0.45)},
     "experiment/flame steps": {"drift": _course("flame_gain", 0.02, after=0.6)},
+    "experiment/flame's rate to and fro": {"drift": _course("flame_rate", 0.04, period=0.7)},
+    "actuator/backlash": {"drive": _with_play(0.01)},
+    "actuator/two notches": {
+        "speaker": lambda s: _notch(190, 0.15, -0.3)(s) * _notch(340, 0.1, 0.4)(s)
+    },
 }
 
 
@@ -442,6 +480,10 @@ def _bent(size: float, power: int) -> Callable[[FloatArray], FloatArray]:
     return lambda v: v + size * v**power
 
 
+def _unequal(size: float) -> Callable[[FloatArray], FloatArray]:
+    return lambda v: v + size * np.abs(v)
+
+
 def _other_gain(gain: float, skew_s: float = 0.0) -> Callable[[FloatArray], Any]:
     return lambda f: (1 + gain) * np.exp(2j * np.pi * skew_s * f)
 
@@ -467,6 +509,10 @@ DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
     "actuator_dynamics/pole": lambda r: {"speaker": _lag_of(_size(r, 100, 2000))},
     "actuator_dynamics/delay": lambda r: {"speaker": _delay_of(_size(r, 1e-4, 3e-3))},
     "actuator_dynamics/highpass": lambda r: {"speaker": _highpass_of(_size(r, 20, 150))},
+    "actuator_dynamics/notch": lambda r: {
+        "speaker": _notch(_size(r, 150, 350), _size(r, 0.05, 0.3), -_size(r, 0.02, 0.6))
+    },
+    "actuator_nonlinearity/unequal_halves": lambda r: {"drive": _unequal(_signed(r, 3e-3, 0.1))},
     "actuator_nonlinearity/tanh": lambda r: {"drive": _limited(_size(r, 2, 8))},
     "actuator_nonlinearity/quadratic": lambda r: {"drive": _bent(_signed(r, 0.005, 0.1), 2)},
     "actuator_nonlinearity/cubic": lambda r: {"drive": _bent(_signed(r, 0.002, 0.04), 3)},
@@ -476,6 +522,9 @@ DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
     },
     "channel_mismatch/both": lambda r: {
         "upper_microphone": _other_gain(_signed(r, 2e-3, 0.04), _signed(r, 1e-6, 4e-5))
+    },
+    "channel_mismatch/resonance": lambda r: {
+        "upper_microphone": _heard_through(_size(r, 1200, 8000), _size(r, 0.05, 0.7))
     },
     "sensor_offset": lambda r: {"measured": _offset(_signed(r, 0.01, 0.08))},
     "interference/mains": lambda r: {"tones": _drawn_hum(r)},
@@ -487,6 +536,18 @@ DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
         "drift": _course("flame_gain", _signed(r, 2e-3, 0.1))
     },
     "parameter_drift/speaker": lambda r: {"drift": _course("at_speaker", _signed(r, 3e-3, 0.1))},
+    "parameter_drift/speaker_settling": lambda r: {
+        "drift": _course("at_speaker", _signed(r, 3e-3, 0.1), settles=_size(r, 0.08, 0.5))
+    },
+    "parameter_drift/frequency_step": lambda r: {
+        "drift": _course("frequency_hz", _signed(r, 3e-4, 1e-2), after=r.uniform(0.3, 0.7))
+    },
+    "parameter_drift/damping_step": lambda r: {
+        "drift": _course("damping", _signed(r, 0.01, 0.2), after=r.uniform(0.3, 0.7))
+    },
+    "parameter_drift/frequency_cycle": lambda r: {
+        "drift": _course("frequency_hz", _signed(r, 3e-4, 1e-2), period=r.uniform(0.5, 1.5))
+    },
     "none": lambda r: {},
 }
 
