@@ -127,6 +127,11 @@ class Dataset:
     def residuals(self) -> int:
         return sum(2 * b.compared * b.runs for b in self.fit)
 
+    @property
+    def span_s(self) -> float:
+        """Seconds from the campaign's start to that of its last run."""
+        return max(float(b.started_s.max()) for b in (*self.fit, *self.validation))
+
     def coarse(self) -> "Dataset":
         """For searching from afar: three harmonics compared, six solved for."""
         return replace(self, fit=tuple(b.limited(3, 6) for b in self.fit))

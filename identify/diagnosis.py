@@ -355,6 +355,8 @@ def _judge(
                 if open_[e.name]
             ]
             said = f"Adding {words} explains the data; no rival does."
+            told = [e.told(best.fit.values, data.span_s) for e in best.effects]
+            said += "".join(f" {sentence}" for sentence in told if sentence)
             said += "".join(
                 f" {t.words} would do as well, but {t.implausibility}."
                 for t in trace.but_for_values(best, implausible)

@@ -278,6 +278,11 @@ class Effect:
         of them a value lies, with no tangent: by name."""
         return {}
 
+    def told(self, values: Mapping[str, float], span_s: float) -> str:
+        """What an experimenter would ask next of these values, in a sentence; `span_s` is the time
+        from the campaign's start to that of its last run."""
+        return ""
+
     def to_internal(self, values: Sequence[float]) -> FloatArray:
         """Unknowns of the effect's own parameters from their physical values."""
         return ParameterSet(self.parameters).to_internal(values)

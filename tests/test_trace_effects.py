@@ -749,6 +749,11 @@ def test_effects_of_two_places_that_leave_far_less_than_any_one(
     # what leaves little less does so for having more numbers
     near = replace(one, fit=fitted(11, 20.0))
     assert whereabouts([near], [both], fitted(10, 500.0)).together is None
+    # what leaves much itself rules no place out
+    lost = replace(one, fit=fitted(11, 900.0))
+    less = tried_as(fitted(12, 30.0), "acoustic_mode:mode", "parameter_drift:frequency")
+    found = whereabouts([], [lost, less], fitted(10, 7000.0))
+    assert (found.likely, found.together) == (("sensor", "forward", "experiment"), None)
 
 
 def test_unexplained_says_where(tmp_path: Path) -> None:

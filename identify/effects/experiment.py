@@ -85,6 +85,11 @@ class Drift(Effect):
     def neutral(self) -> tuple[float, ...] | None:
         return None if self.settles else (0.0,) * len(self.parameters)
 
+    def told(self, values: Mapping[str, float], span_s: float) -> str:
+        if not self.settles:
+            return ""
+        return f"It settles within {values[self.parameters[1].name] * span_s:.0f} s (1/e)."
+
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.0, q) for q in (0.06, 0.1, 0.17, 0.3, 0.6)] if self.settles else []
 
@@ -148,6 +153,10 @@ class Step(Effect):
         before, after = _next_to(self.times, values[self.when.name])
         return {self.when.name: (after - before) / np.sqrt(12.0)}
 
+    def told(self, values: Mapping[str, float], span_s: float) -> str:
+        before, after = _next_to(self.times, values[self.when.name])
+        return f"It came between {before * span_s:.0f} s and {after * span_s:.0f} s."
+
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         change, when = (p[q.name] for q in self.parameters)
         return changed(modes, self.what, step(at, change, when))
@@ -191,6 +200,10 @@ class Cycle(Effect):
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.0, 0.0, period) for period in (0.3, 0.4, 0.52, 0.68, 0.9, 1.3, 2.0)]
+
+    def told(self, values: Mapping[str, float], span_s: float) -> str:
+        sine, cosine, period = (values[q.name] for q in self.parameters)
+        return f"It is ± {np.hypot(sine, cosine):.2g} within {period * span_s:.0f} s."
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         sine, cosine, period = (p[q.name] for q in self.parameters)

@@ -16,7 +16,7 @@ from identify.dataset import Dataset
 from identify.effects.shaped import CHANCES, PIECES, Setting, Shaped, ShapedMemory
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits, no_better
-from identify.results import Whereabouts
+from identify.results import PARTLY, Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
 from identify.structure import Effect, Structure
 from identify.trace.exchange import joins
@@ -177,7 +177,10 @@ def whereabouts(pieces: Sequence[Tried], tries: Sequence[Tried], base: Fit) -> W
         together, best = several.fit.chi2_per_dof, next(iter(left.values()))
         if together < best / FAR_LESS:
             both = tuple(dict.fromkeys(e.location for e in several.effects))
-            return Whereabouts(both, left, base.chi2_per_dof, together=together)
+            if together <= PARTLY:
+                return Whereabouts(both, left, base.chi2_per_dof, together=together)
+            # what leaves so much is not what is missing, and rules no place out
+            likely = tuple(dict.fromkeys((*likely, *both)))
     if pieces and likely and not places[likely[0]].adequate:  # no shape there says nothing of it
         likely += tuple(dict.fromkeys(p.location for p in PIECES if p.location not in left))
     return Whereabouts(likely, left, base.chi2_per_dof)
