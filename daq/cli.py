@@ -15,6 +15,7 @@ from daq.service.commands import (
     data,
     demo,
     design,
+    effects,
     hil,
     keys,
     loop,
@@ -39,6 +40,7 @@ app.command("demo")(demo.demo)
 app.command("import")(data.import_)
 app.command("identify")(analysis.identify)
 app.command("diagnose")(analysis.diagnose)
+app.command("effects")(effects.effects)
 app.command("close-loop")(loop.close_loop)
 app.command("characterise")(analysis.characterise)
 app.command("check")(rig.check)

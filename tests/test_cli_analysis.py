@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from identify.characterise import Recording, primary
+from identify.effects import CANDIDATES
 from tests.test_cli_data import entrain, home
 
 __all__ = ["home"]
@@ -84,3 +85,21 @@ def test_the_signal_that_is_characterised_is_the_one_drawn(
     np.testing.assert_allclose(drawn[0], rows[1])
     for note in json.loads((home / "found.json").read_text("utf-8"))["notes"]:
         assert note[:40] in out
+
+
+def test_what_a_diagnosis_can_find_is_listed(
+    home: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every candidate, with the range that its parameters may be in."""
+    monkeypatch.setenv("COLUMNS", "140")
+    code, out, _ = entrain(capfd, "effects")
+    assert code == 0
+    assert all(e.name in out and e.form in out for e in CANDIDATES)
+    assert "skew_s: -0.01 to 0.01 s" in out
+    code, out, _ = entrain(capfd, "effects", "flame_delay", "--json", "-")
+    (delay,) = json.loads(out)["effects"]
+    assert (code, delay["location"]) == (0, "flame")
+    assert delay["parameters"] == [{"name": "delay_s", "unit": "s", "range": [0.0, 0.02]}]
+    code, out, err = entrain(capfd, "effects", "flame_delays")
+    assert (code, out) == (2, "")
+    assert "name='flame_delays' is no effect: one of acoustic_mode" in " ".join(err.split())
