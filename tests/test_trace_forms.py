@@ -211,6 +211,31 @@ def test_an_amplifier_of_unequal_halves(tmp_path: Path) -> None:
     assert abs(size.value - a) < 4 * size.stderr < a
 
 
+@pytest.mark.parametrize("milliseconds", [2.9, 13.0])
+def test_a_long_delay_of_the_drive(tmp_path: Path, milliseconds: float) -> None:
+    """Half a cycle of the tube and more: a delay has a minimum every half cycle, and from one of
+    3 % or 20 % of a cycle the fit came to the nearest. A mode and a peak of the speaker were
+    claimed."""
+
+    def late(run: RecordedRun) -> RecordedRun:
+        return replace(run, drive=np.roll(run.drive, -round(10 * milliseconds)))
+
+    ready = altered_campaign(tmp_path, 7, late)
+    found = identify.diagnose(ready.campaign, catalogue=[by_key("actuator_dynamics:delay")])
+    assert (found.verdict, [e.form for e in found.effects]) == ("traced", ["delay"])
+    delay = found.effects[0].parameters["actuator_dynamics.delay_s"]
+    assert abs(delay.value - 1e-3 * milliseconds) < 4 * delay.stderr < 1e-5
+
+
+def test_a_long_delay_of_the_flame(tmp_path: Path) -> None:
+    """The gas takes most of a cycle from where it is moved to where it burns."""
+    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 5.5e-3}})
+    found = identify.diagnose(ready.campaign, catalogue=[by_key("flame_delay")])
+    assert (found.verdict, [e.effect for e in found.effects]) == ("traced", ["flame_delay"])
+    delay = found.effects[0].parameters["flame_delay.delay_s"]
+    assert abs(delay.value - 5.5e-3) < 4 * delay.stderr < 1e-4
+
+
 def test_a_notch_of_the_speaker(tmp_path: Path) -> None:
     hz, damping, peak = 185.0, 0.15, -0.45
 

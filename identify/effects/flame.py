@@ -9,6 +9,8 @@ from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Values
 
+#: Of the free one: delays to start from, up to several, since their misfit has as many minima.
+CYCLES = (0.02, 0.08, *np.arange(0.2, 3.4, 0.15).tolist())
 CANCELS = 0.2  # of a zero's frequency: so near to it a pole is as good as none
 
 
@@ -19,8 +21,7 @@ class FlameDelay(Effect):
     parameters = (Parameter("flame_delay.delay_s", "s", 0.0, 0.02, scale=1e-4),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        period = 1 / known.free_hz
-        return [(0.02 * period,), (0.08 * period,), (0.2 * period,)]
+        return [(q / known.free_hz,) for q in CYCLES]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,)
