@@ -227,6 +227,19 @@ def test_a_long_delay_of_the_drive(tmp_path: Path, milliseconds: float) -> None:
     assert abs(delay.value - 1e-3 * milliseconds) < 4 * delay.stderr < 1e-5
 
 
+def test_a_channel_that_began_late(tmp_path: Path) -> None:
+    """By 2 ms, as of another converter; from a microsecond no descent comes there."""
+
+    def late(run: RecordedRun) -> RecordedRun:
+        return replace(run, p2=np.roll(run.p2, 20))
+
+    ready = altered_campaign(tmp_path, 7, late)
+    found = identify.diagnose(ready.campaign, catalogue=[by_key("channel_mismatch:skew")])
+    assert (found.verdict, [e.form for e in found.effects]) == ("traced", ["skew"])
+    skew = found.effects[0].parameters["channel_mismatch.skew_s"]
+    assert abs(skew.value - 2e-3) < 4 * skew.stderr < 1e-5
+
+
 def test_a_long_delay_of_the_flame(tmp_path: Path) -> None:
     """The gas takes most of a cycle from where it is moved to where it burns."""
     ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 5.5e-3}})

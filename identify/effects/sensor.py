@@ -14,6 +14,8 @@ from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
+CYCLES = np.arange(0.1, 1.75, 0.15).tolist()  # of the free one: skews to start from
+
 
 def upper_pressure(at: Conditions, s: Any) -> Any:
     """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
@@ -74,7 +76,11 @@ class ChannelMismatch(Effect):
         self.refines = form in ("gain_lowpass", "gain_highpass", "skew_lowpass")
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [tuple(p.scale for p in self.parameters)]
+        small = tuple(p.scale for p in self.parameters)
+        if self.form != "skew":
+            return [small]
+        # a delay, as of a converter that began later: a minimum every half cycle
+        return [small, *((sign * q / known.free_hz,) for q in CYCLES for sign in (1.0, -1.0))]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.parameters)
