@@ -182,6 +182,9 @@ def diagnose(
     before, after = _with_lock_in(before, after, data, run)
     claimed = verdict in ("traced", "ambiguous") and chosen is not None
     effects = (*_traced(chosen, tried), *tones) if claimed and chosen else tuple(tones)
+    if claimed and chosen:
+        told = [e.told(chosen.fit.values, data.span_s) for e in chosen.effects]
+        explanation += "".join(f" {sentence}" for sentence in told if sentence)
     report(0.99, "choosing the next experiment")
     next_experiment = _next(ready, verdict, tried, chosen)
     report(1.0, "done")
@@ -355,8 +358,6 @@ def _judge(
                 if open_[e.name]
             ]
             said = f"Adding {words} explains the data; no rival does."
-            told = [e.told(best.fit.values, data.span_s) for e in best.effects]
-            said += "".join(f" {sentence}" for sentence in told if sentence)
             said += "".join(
                 f" {t.words} would do as well, but {t.implausibility}."
                 for t in trace.but_for_values(best, implausible)
