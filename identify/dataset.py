@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from identify.harmonics import Harmonics, Microphones
 from identify.record import Medium
-from identify.structure import Conditions, Structure
+from identify.structure import Conditions, Effect, Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
@@ -126,6 +126,12 @@ class Dataset:
     @property
     def residuals(self) -> int:
         return sum(2 * b.compared * b.runs for b in self.fit)
+
+    def among(self, effects: Sequence[Effect]) -> tuple[Effect, ...]:
+        """The effects for these runs."""
+        fitted = [float(t) for b in self.fit for t in b.at.time]
+        held_out = [float(t) for b in self.validation for t in b.at.time]
+        return tuple(e.among(fitted, held_out) for e in effects)
 
     @property
     def span_s(self) -> float:

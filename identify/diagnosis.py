@@ -90,7 +90,7 @@ def diagnose(
     data, fit = drive.refitted(start.fit_declared(ready.structure, recorded), recorded)
     ready = replace(ready, data=data)
     run = executor or InProcess()
-    catalogue = trace.among_runs(catalogue, data)
+    catalogue = data.among(catalogue)
     declared = _declared(fit, ready, catalogue, run)
     tried: list[Tried] = []
     searched: tuple[Dataset, Fit, Sequence[Tried]] = data, declared.fit, ()

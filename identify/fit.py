@@ -631,16 +631,18 @@ def covariance_of(jacobian: FloatArray) -> FloatArray:
 
 def resolved(structure: Structure, theta: FloatArray, covariance: FloatArray) -> FloatArray:
     """The covariance of θ's unknowns, with what the tangents do not say (`Effect.resolution`)."""
-    parameters = structure.parameters
-    values, slopes = parameters.plain(theta), parameters.slopes(theta)
-    out = covariance
-    for effect in structure.effects:
-        for name, stderr in effect.resolution(values).items():
-            i = parameters.index[name]
-            out = out.copy()
-            out[i], out[:, i] = 0.0, 0.0
-            out[i, i] = (stderr / slopes[i]) ** 2
+    out, slopes = covariance.copy(), structure.parameters.slopes(theta)
+    for i, stderr in resolutions(structure, theta).items():
+        out[i], out[:, i] = 0.0, 0.0
+        out[i, i] = (stderr / slopes[i]) ** 2
     return out
+
+
+def resolutions(structure: Structure, theta: FloatArray) -> dict[int, float]:
+    """Standard deviations of the values that lie between two runs, wherever: by unknown."""
+    values, index = structure.parameters.plain(theta), structure.parameters.index
+    known = [e.resolution(values) for e in structure.effects]
+    return {index[name]: stderr for each in known for name, stderr in each.items()}
 
 
 def log_determinant_of(jacobian: FloatArray) -> float:

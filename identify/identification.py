@@ -14,7 +14,7 @@ from identify import assess, dataset, drive, harmonics, profile, quality, start
 from identify.dataset import Dataset
 from identify.declare import ModelError
 from identify.executor import InProcess, Progress
-from identify.fit import Fit, failed
+from identify.fit import Fit, failed, resolutions
 from identify.harmonics import Harmonics
 from identify.record import Campaign, DeclaredModel
 from identify.results import Identification
@@ -92,6 +92,7 @@ def prepare(campaign: Campaign, structure: Structure | None = None) -> Prepared:
     usable = next(r for r in campaign.runs if r.name == measured[0].name)
     mics = harmonics.microphones(usable)
     data = dataset.build(measured, campaign.medium, mics)
+    chosen = replace(chosen, effects=data.among(chosen.effects))
     return Prepared(campaign, chosen, found, tuple(measured), data)
 
 
@@ -166,8 +167,10 @@ def undetermined(fit: Fit, data: Dataset, limit: float = 1.0) -> tuple[str, ...]
     """
     if not fit.converged:
         return ()
-    names = fit.structure.parameters.names
-    J = fit.jacobian * _sizes(fit, data)
+    known = resolutions(fit.structure, fit.theta)
+    asked = [i for i in range(fit.theta.size) if i not in known]
+    names = [fit.structure.parameters.names[i] for i in asked]
+    J = (fit.jacobian * _sizes(fit, data))[:, asked]
     _, sv, Vt = np.linalg.svd(J, full_matrices=False)
     out = []
     for s, v in zip(sv, Vt, strict=True):

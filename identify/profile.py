@@ -19,7 +19,14 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Dataset
-from identify.fit import Fit, OrbitResidual, Straightened, covariance_of, levenberg_marquardt
+from identify.fit import (
+    Fit,
+    OrbitResidual,
+    Straightened,
+    covariance_of,
+    levenberg_marquardt,
+    resolutions,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -87,7 +94,8 @@ def _doubtful(fit: Fit, data: Dataset) -> list[int]:
     )
     rise = _rise(fit, data, moved.reshape(2 * p, p)).reshape(2, p)
     out = []
-    for j in range(p):
+    known = resolutions(fit.structure, fit.theta)
+    for j in (j for j in range(p) if j not in known):
         ends = np.array([parameters.to_physical(m[j])[j] for m in moved])
         t = np.abs(ends - centre[j]) / max(float(stderr[j]), 1e-300)
         ratio = rise[:, j] / np.maximum(t, 1e-300)

@@ -182,6 +182,23 @@ def test_what_changes_at_once_or_to_and_fro(tmp_path: Path, what: str, course: s
         assert abs(when.value - ONCE) < 1.8 * when.stderr < 0.3
 
 
+def test_a_step_may_be_declared(tmp_path: Path) -> None:
+    """Of a campaign in which somebody knows that a knob was turned."""
+
+    def change(plant: Plant, t: float) -> Plant:
+        return drifted(plant, [Drift("flame_gain", CHANGE * (t > ONCE), 1.0)], 1.0)
+
+    ready = changing(tmp_path, change)
+    step = by_key("parameter_drift:flame_gain_step")
+    found = identify.identify(ready.campaign, structure=ready.structure.with_effects(step))
+    assert found.assessment.fit.converged
+    size = found.assessment.fit.estimates["parameter_drift.relative_change"]
+    assert abs(size.value - CHANGE) < 4 * size.stderr < 0.1 * CHANGE
+    when = found.intervals["parameter_drift.step_time"]
+    assert when.method == "gaussian"
+    assert not any("step_time" in said for said in found.undetermined)
+
+
 def test_held_out_runs_tell_on_which_side_of_a_step_they_lie() -> None:
     fitted_at, between = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8), {"parameter_drift.step_time": 0.3}
     assert Step("damping").between == []  # of which runs?

@@ -40,7 +40,7 @@ from identify.trace.lone import lone_run
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
 from identify.trace.selection import Cancelled, refitted, search, without_effects
-from identify.trace.stages import among_runs, started_again, try_effects, usable
+from identify.trace.stages import started_again, try_effects, usable
 from identify.trace.tried import ALPHA, EVIDENCE, Tried, astray, best_by_name, best_form, foremost
 
 __all__ = [
@@ -51,7 +51,6 @@ __all__ = [
     "Tried",
     "accounts",
     "against_chance",
-    "among_runs",
     "astray",
     "best_by_name",
     "best_form",

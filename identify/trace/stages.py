@@ -540,13 +540,6 @@ def knows_pressure(data: Dataset) -> bool:
     return any(np.any(b.at.pressure != 0) for b in data.fit)
 
 
-def among_runs(catalogue: Sequence[Effect], data: Dataset) -> list[Effect]:
-    """The effects for the runs of a campaign."""
-    fitted = [float(t) for b in data.fit for t in b.at.time]
-    held_out = [float(t) for b in data.validation for t in b.at.time]
-    return [e.among(fitted, held_out) for e in catalogue]
-
-
 def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
     """Whether the effect can be added to this declared model and asked of these data."""
     if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
