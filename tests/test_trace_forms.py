@@ -147,8 +147,13 @@ def test_drifts_of_one_thing_alone(
 
 
 ONCE, PERIOD = 0.45, 0.8  # of the campaign: when a knob is turned, and how long a cycle takes
+SETTLES = 0.1  # of the campaign: sooner than its second run or third
 COURSES = {
     "step": (lambda t: CHANGE * (t > ONCE), {"relative_change": CHANGE}),
+    "settling": (
+        lambda t: CHANGE * (1 - np.exp(-t / SETTLES)),
+        {"relative_change": CHANGE, "settling_time": SETTLES},
+    ),
     "cycle": (
         lambda t: CHANGE * np.sin(2 * np.pi * t / PERIOD),
         {"sine": CHANGE, "cosine": 0.0, "period": PERIOD},
@@ -158,7 +163,7 @@ COURSES = {
 
 @pytest.mark.parametrize("course", COURSES)
 @pytest.mark.parametrize("what", ["frequency", "flame_gain", "damping", "speaker_gain"])
-def test_what_changes_at_once_or_to_and_fro(tmp_path: Path, what: str, course: str) -> None:
+def test_what_changes_at_once_or_soon_or_to_and_fro(tmp_path: Path, what: str, course: str) -> None:
     """Without these forms a step of the flame's gain was claimed as its random modulation, and one
     of the speaker's as a drive that scatters."""
     moved, truth = COURSES[course]
@@ -174,7 +179,7 @@ def test_what_changes_at_once_or_to_and_fro(tmp_path: Path, what: str, course: s
     (effect,) = found.effects
     assert (effect.effect, effect.form) == ("parameter_drift", f"{what}_{course}")
     for name, value in truth.items():
-        size = value if name == "period" else share * value
+        size = value if name in ("period", "settling_time") else share * value
         e = effect.parameters[f"parameter_drift.{name}"]
         assert abs(e.value - size) < 4 * e.stderr
     if course == "step":  # between the runs on either side, anywhere
