@@ -27,7 +27,7 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from identify.fit import Fit, covariance_of, resolved
+from identify.fit import Fit, resolved
 from identify.foresee import Past, Possible, possible
 from identify.identification import Prepared
 from identify.parameters import Estimate
@@ -317,7 +317,7 @@ def expected_estimates(fit: Fit, ready: Prepared, chosen: Chosen) -> dict[str, E
     if runs is not None and runs.options:
         new = runs.seen_by(fit.structure, fit.theta).jacobian
         stacked = np.concatenate([stacked, new.reshape(-1, fit.theta.size)])
-    known = resolved(fit.structure, fit.theta, covariance_of(stacked))
+    known = resolved(fit.structure, fit.theta, stacked)
     return fit.structure.parameters.estimates(fit.theta, known)
 
 

@@ -629,9 +629,9 @@ def covariance_of(jacobian: FloatArray) -> FloatArray:
     return np.asarray(((Vt.T * (1.0 / sv**2)) @ Vt) / np.outer(norm, norm))
 
 
-def resolved(structure: Structure, theta: FloatArray, covariance: FloatArray) -> FloatArray:
+def resolved(structure: Structure, theta: FloatArray, jacobian: FloatArray) -> FloatArray:
     """The covariance of θ's unknowns, with what the tangents do not say (`Effect.resolution`)."""
-    out, slopes = covariance.copy(), structure.parameters.slopes(theta)
+    out, slopes = covariance_of(jacobian), structure.parameters.slopes(theta)
     for i, stderr in resolutions(structure, theta).items():
         out[i], out[:, i] = 0.0, 0.0
         out[i, i] = (stderr / slopes[i]) ** 2
@@ -754,7 +754,7 @@ def _from_each(
         theta,
         best.cost,
         dof,
-        resolved(structure, theta, covariance_of(jacobian)),
+        resolved(structure, theta, jacobian),
         best.residual,
         jacobian,
         best.converged,

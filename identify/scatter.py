@@ -26,7 +26,7 @@ from identify import assess
 from identify.chances import rank_correlation
 from identify.dataset import Batch, Dataset
 from identify.effects.scatter import Scatter
-from identify.fit import Fit, covariance_of, resolved
+from identify.fit import Fit, resolved
 from identify.own import Led, Own, lead, settle
 from identify.parameters import Estimate
 from identify.randomness import law_in
@@ -200,7 +200,7 @@ def _fit(structure: Structure, led: Led, rows: Sequence[_Rows], sizes: FloatArra
         led.theta,
         float(residual @ residual),
         residual.size - led.theta.size,
-        resolved(structure, led.theta, covariance_of(jacobian)),
+        resolved(structure, led.theta, jacobian),
         residual,
         jacobian,
         led.converged,

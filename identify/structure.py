@@ -375,7 +375,11 @@ class Known:
     velocity_amplitude: float
     drive_amplitude: float
     band_hz: tuple[float, float]
-    runs: int
+
+    def delays(self, cycles: float) -> list[float]:
+        """Delays to start from, s, up to so many periods of the free oscillation: their misfit has
+        a minimum every half of one."""
+        return [q / self.free_hz for q in (0.02, 0.08, *np.arange(0.2, cycles, 0.16).tolist())]
 
 
 @dataclass(frozen=True)

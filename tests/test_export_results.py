@@ -21,7 +21,7 @@ from tests.test_report_responses import as_fit
 F = np.array([10.0, 90.0, 168.0, 170.0, 281.0, 400.0, 900.0])
 KNOWN = Known(
     169.0, (168.8, 281.3), (0.01, 0.05), (44.3, -16.2), (35.2, -34.0), 2e-4, 0.25, 1.0,
-    (160.0, 900.0), 8,
+    (160.0, 900.0),
 )  # fmt: skip
 PLACES = ("forward", "flame", "actuator", "experiment")
 LINEAR = [

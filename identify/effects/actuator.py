@@ -13,7 +13,6 @@ from identify.structure import Bent, Conditions, Effect, Known, Values
 
 FloatArray = npt.NDArray[np.float64]
 
-CYCLES = (0.03, *np.arange(0.2, 4.0, 0.17).tolist())  # delays: their misfit has as many minima
 UNEQUAL = (0.87, 0.95, 1.05, 1.15)  # of one level, where the two of a pair are sought
 
 
@@ -139,7 +138,7 @@ class ActuatorDelay(Effect):
     parameters = (Parameter("actuator_dynamics.delay_s", "s", 0.0, 0.05, scale=1e-4),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(q / known.free_hz,) for q in CYCLES]
+        return [(q,) for q in known.delays(cycles=8.0)]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,)

@@ -88,7 +88,7 @@ class Drift(Effect):
     def told(self, values: Mapping[str, float], span_s: float) -> str:
         if not self.settles:
             return ""
-        return f"It settles within {values[self.parameters[1].name] * span_s:.0f} s (1/e)."
+        return _settles(values[self.parameters[1].name], span_s)
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.0, q) for q in (0.06, 0.1, 0.17, 0.3, 0.6)] if self.settles else []
@@ -101,6 +101,10 @@ class Drift(Effect):
             curvature = p["parameter_drift.curvature"] if self.curved else None
             factor = course(at, change, curvature)
         return changed(modes, self.what, factor)
+
+
+def _settles(time: float, span_s: float) -> str:
+    return f"It settles within {time * span_s:.0f} s (1/e)."
 
 
 class Step(Effect):
@@ -261,6 +265,9 @@ class Warming(Effect):
             change = 0.0
         times = (values[time],) if time in values else (0.3, 1.0)
         return [(change, values.get(damping, 0.0), q) for q in times]
+
+    def told(self, values: Mapping[str, float], span_s: float) -> str:
+        return _settles(values[self.parameters[-1].name], span_s)
 
     def modes(self, p: Values, at: Conditions, modes: list[Mode]) -> list[Mode]:
         size, damping, time = (p[q.name] for q in self.parameters)

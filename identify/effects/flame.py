@@ -9,8 +9,6 @@ from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Values
 
-#: Of the free one: delays to start from, up to several, since their misfit has as many minima.
-CYCLES = (0.02, 0.08, *np.arange(0.2, 3.4, 0.15).tolist())
 CANCELS = 0.2  # of a zero's frequency: so near to it a pole is as good as none
 
 
@@ -21,7 +19,7 @@ class FlameDelay(Effect):
     parameters = (Parameter("flame_delay.delay_s", "s", 0.0, 0.02, scale=1e-4),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(q / known.free_hz,) for q in CYCLES]
+        return [(q,) for q in known.delays(cycles=4.0)]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,)

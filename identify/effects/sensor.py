@@ -14,8 +14,6 @@ from identify import dual
 from identify.parameters import Parameter
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
-CYCLES = np.arange(0.1, 1.75, 0.15).tolist()  # of the free one: skews to start from
-
 
 def upper_pressure(at: Conditions, s: Any) -> Any:
     """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
@@ -79,8 +77,8 @@ class ChannelMismatch(Effect):
         small = tuple(p.scale for p in self.parameters)
         if self.form != "skew":
             return [small]
-        # a delay, as of a converter that began later: a minimum every half cycle
-        return [small, *((sign * q / known.free_hz,) for q in CYCLES for sign in (1.0, -1.0))]
+        # a delay of either, as of a converter that began later
+        return [small, *((sign * q,) for q in known.delays(cycles=2.0) for sign in (1.0, -1.0))]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.parameters)

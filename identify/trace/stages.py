@@ -71,7 +71,6 @@ def known_sizes(data: Dataset, fit: Fit) -> Known:
         velocity_amplitude=velocity,
         drive_amplitude=drive,
         band_hz=(float(omega.min()), float(omega.max())),
-        runs=sum(b.runs for b in data.fit),
     )
 
 
