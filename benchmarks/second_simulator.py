@@ -340,6 +340,11 @@ def _offset(metres: float) -> Numbers:
     return tuple(ratio.tolist())
 
 
+def _bends(share: float, power: int) -> Callable[[FloatArray], FloatArray]:
+    """A microphone that adds such a power of what it hears, by that share at 800 Pa."""
+    return lambda p: p + share * p * (p / 800) ** (power - 1)
+
+
 BASE = Tube()
 EFFECTS: dict[str, dict[str, Any]] = {
     "none": {},
@@ -382,6 +387,8 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "channel_mismatch/lowpass": {"upper_microphone": lambda f: 1 / (1 + 1j * f / 6000)},
     "channel_mismatch/resonance": {"upper_microphone": _heard_through(2500, 0.3)},
     "channel_mismatch/highpass": {"upper_microphone": lambda f: 1j * f / (1j * f + 5)},
+    "sensor_nonlinearity/cubic": {"microphones": (_bends(-0.01, 3),) * 2},
+    "sensor_nonlinearity/lower": {"microphones": (_bends(0.003, 2),)},
     "sensor_offset/3cm": {"measured": _offset(-0.03)},
     "sensor_offset/6cm": {"measured": _offset(0.06)},
     "interference/mains": {"tones": ((50.0, 4.0), (150.0, 1.0))},
@@ -415,11 +422,6 @@ PAIRS = (
 )
 
 
-def _bends(size: float) -> Callable[[FloatArray], FloatArray]:
-    """A microphone that compresses by that share at its largest."""
-    return lambda p: p * (1 - size * (p / np.max(np.abs(p))) ** 2)
-
-
 #: What no candidate is a law for, by place: any of those before the stroke is right.
 STRANGERS: dict[str, dict[str, Any]] = {
     "flame nonlinearity/slower when strong": {"rate_bend": 0.03 / 4000**2},
@@ -427,8 +429,6 @@ STRANGERS: dict[str, dict[str, Any]] = {
     "forward/stiffer when strong": {"stiffness": 1e-5 / 470**2},
     "actuator/motor follows displacement": {"drive": lambda v: v * (1 + 0.02 * np.roll(v, 1024))},
     "sensor/crosstalk of the drive": {"crosstalk": 0.5},
-    "sensor/one microphone compresses": {"microphones": (lambda p: p, _bends(0.003))},
-    "sensor/both microphones compress": {"microphones": (_bends(0.01), _bends(0.01))},
     "experiment/flame steps": {"drift": _course("flame_gain", 0.02, after=0.6)},
     "experiment/flame's rate to and fro": {"drift": _course("flame_rate", 0.04, period=0.7)},
     "actuator/backlash": {"drive": _with_play(0.01)},
@@ -488,6 +488,10 @@ def _other_gain(gain: float, skew_s: float = 0.0) -> Callable[[FloatArray], Any]
     return lambda f: (1 + gain) * np.exp(2j * np.pi * skew_s * f)
 
 
+def _both(microphone: Callable[[FloatArray], FloatArray]) -> dict[str, Any]:
+    return {"microphones": (microphone, microphone)}
+
+
 DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
     "acoustic_mode/third": lambda r: {"modes": 3},
     "acoustic_mode/two": lambda r: {"modes": 4},
@@ -525,6 +529,12 @@ DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
     },
     "channel_mismatch/resonance": lambda r: {
         "upper_microphone": _heard_through(_size(r, 1200, 8000), _size(r, 0.05, 0.7))
+    },
+    "sensor_nonlinearity/both": lambda r: _both(
+        _bends(_signed(r, 1e-3, 0.1), int(r.integers(2, 4)))
+    ),
+    "sensor_nonlinearity/upper": lambda r: {
+        "microphones": (lambda p: p, _bends(_signed(r, 1e-4, 0.02), int(r.integers(2, 4))))
     },
     "sensor_offset": lambda r: {"measured": _offset(_signed(r, 0.01, 0.08))},
     "interference/mains": lambda r: {"tones": _drawn_hum(r)},

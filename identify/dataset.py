@@ -45,6 +45,7 @@ class Batch:
     started_s: FloatArray
     drive_noise: FloatArray | None = None  # E|n|² of each run's drive coefficients, (runs,)
     pressure_noise: FloatArray | None = None  # of the pressure's at the harmonics balanced
+    shared_noise: ComplexArray | None = None  # E[n n_P*] with that, likewise
 
     @property
     def runs(self) -> int:
@@ -71,7 +72,7 @@ class Batch:
             "started_s",
         )
         picked = {n: getattr(self, n)[rows] for n in arrays}
-        for n in ("drive_noise", "pressure_noise"):
+        for n in ("drive_noise", "pressure_noise", "shared_noise"):
             if getattr(self, n) is not None:
                 picked[n] = getattr(self, n)[rows]
         names = tuple(self.names[int(i)] for i in rows)
@@ -92,6 +93,7 @@ class Batch:
             covariance=covariance,
             whitener=np.stack([whitener(c) for c in covariance]),
             pressure_noise=None if self.pressure_noise is None else self.pressure_noise[:, :total],
+            shared_noise=None if self.shared_noise is None else self.shared_noise[:, :total],
         )
 
     def balanced(self, structure: Structure) -> "Batch":
@@ -246,6 +248,9 @@ def _batch(
         started_s=np.array([h.started_s for h in hs]),
         drive_noise=np.array([h.drive_variance for h in hs]),
         pressure_noise=pad([h.pressure_noise for h in hs]).real,
+        shared_noise=pad([h.shared_noise for h in hs if h.shared_noise is not None])
+        if all(h.shared_noise is not None for h in hs)
+        else None,
     )
 
 

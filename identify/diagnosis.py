@@ -226,9 +226,9 @@ def _odd_run(
 
 
 def _after(chosen: Tried, data: Dataset, noise_floor: float) -> Assessment:
-    """The chosen model against the data; a spread from run to run counts with its coefficients'
-    noise, but not with the noise floor."""
-    wide = data if chosen.spread is None else chosen.spread.data
+    """The chosen model against the data; a spread from run to run, and what a correction makes of
+    the noise, count with its coefficients' noise, but not with the noise floor."""
+    wide = (chosen.counted or data) if chosen.spread is None else chosen.spread.data
     return replace(assess.assess(chosen.fit, wide), noise_floor=noise_floor)
 
 
@@ -268,10 +268,10 @@ def _declared(
     fit: Fit, ready: Prepared, catalogue: Sequence[Effect], executor: Executor
 ) -> _Declared:
     structure, data = ready.structure, ready.data
-    assessment = assess.assess(fit, data)
+    model = as_tried((), fit, data)
+    assessment = assess.assess(model.fit, model.counted or data)
     usable = [e for e in catalogue if trace.usable(e, data, structure)] if fit.converged else []
     scores = trace.score_tests(structure, data, fit, usable, executor)
-    model = as_tried((), fit, data)
     tests = [model.fit_p, model.validation_p, trace.family_p(list(scores.values()))]
     taken = [p for p in tests if np.isfinite(p)]
     # the least of so many: corrected for that (Bonferroni)

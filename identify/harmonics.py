@@ -54,8 +54,9 @@ class Harmonics:
     `velocity`, `drive`, `pressure` (mean of the two microphones): (K,) complex, phases relative
     to the drive's fundamental (free runs: to the velocity's). `covariance`: (2K, 2K) of
     [Re, Im] of the velocity's coefficients; `side`: (2M, K) complex coefficients of the noise at
-    the neighbouring bins, from which it was estimated. `drive_variance` is E|n|² of the drive's
-    coefficients. `frequency_stderr_hz` is 0 for forced runs.
+    the neighbouring bins, from which it was estimated. `pressure_noise` is E|n_P|² and
+    `shared_noise` E[n_V n_P*], (K,): nothing where both microphones are as loud; `drive_variance`
+    is E|n|² of the drive's coefficients. `frequency_stderr_hz` is 0 for forced runs.
     """
 
     name: str
@@ -74,6 +75,7 @@ class Harmonics:
     duration_s: float
     nominal_hz: float | None
     amplitude_v: float | None
+    shared_noise: ComplexArray | None = None
 
     @property
     def count(self) -> int:
@@ -106,6 +108,7 @@ class Harmonics:
             covariance=self.covariance[np.ix_(keep, keep)],
             side=self.side[:, :count],
             pressure_noise=self.pressure_noise[:count],
+            shared_noise=None if self.shared_noise is None else self.shared_noise[:count],
         )
 
 
@@ -198,7 +201,7 @@ def measure(
             )
     if mics is None:
         velocity, pressure = c[0], np.zeros(K, dtype=complex)
-        noise, pressure_noise = side[0], np.zeros(K)
+        noise, pressure_noise, shared_noise = side[0], np.zeros(K), None
         coarse = np.full(K, hidden[0])
     else:
         offset = 2 * np.pi * side_offsets(run.duration_s)[:, None]
@@ -206,7 +209,9 @@ def measure(
         velocity = -(c[1] - c[0]) / (scale * 1j * omega)
         pressure = 0.5 * (c[0] + c[1])
         noise = -(side[1] - side[0]) / (scale * 1j * (omega + offset))
-        pressure_noise = (np.mean(np.abs(side[0] + side[1]) ** 2, axis=0) + hidden[:2].sum()) / 4
+        beside = 0.5 * (side[0] + side[1])
+        pressure_noise = np.mean(np.abs(beside) ** 2, axis=0) + hidden[:2].sum() / 4
+        shared_noise = np.mean(noise * beside.conj(), axis=0)
         coarse = hidden[:2].sum() / (scale * omega) ** 2
     covered = np.zeros(K)
     for f, order in on.items():
@@ -217,9 +222,9 @@ def measure(
     turn = np.exp(-1j * np.angle(reference_c) * k)
     noise = noise * turn
     distorted = (DISTORTION * np.abs(velocity[0])) ** 2
-    beside = coarse + covered + distorted
+    added = coarse + covered + distorted
     covariance = coefficient_covariance(noise)
-    covariance = covariance + np.diag(np.tile(beside, 2) / 2)
+    covariance = covariance + np.diag(np.tile(added, 2) / 2)
     stderr = 0.0
     if run.kind == "free":
         both = slice(0, len(inputs))
@@ -242,6 +247,7 @@ def measure(
         duration_s=run.duration_s,
         nominal_hz=run.frequency_hz,
         amplitude_v=run.amplitude_v,
+        shared_noise=shared_noise,
     )
 
 

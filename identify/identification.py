@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from identify import assess, dataset, drive, harmonics, profile, quality, start
+from identify import assess, corrected, dataset, drive, harmonics, profile, quality, start
 from identify.dataset import Dataset
 from identify.declare import ModelError
 from identify.executor import InProcess, Progress
@@ -112,7 +112,9 @@ def identify(
     report(0.0, "measuring harmonics")
     ready = prepare(campaign, structure)
     report(0.2, "fitting the declared model")
-    data, fit = drive.refitted(fit_structure(ready.structure, ready.data), ready.data)
+    fit = fit_structure(ready.structure, ready.data)
+    data, fit, _ = corrected.refitted(fit, ready.data)
+    data, fit = drive.refitted(fit, data)
     report(0.9, "validating")
     assessment = replace(assess.assess(fit, data), lock_in=assess.lock_in((fit, data)))
     report(0.95, "intervals")

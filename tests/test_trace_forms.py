@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy import stats
 
@@ -57,6 +58,7 @@ from tests.trace_material import (
 
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
+FloatArray = npt.NDArray[np.float64]
 S = 2j * np.pi * 170.0 * np.arange(1, 4)
 NOWHERE = forced_conditions()
 CHANGE = 0.05
@@ -323,6 +325,50 @@ def test_a_microphone_with_a_resonance(tmp_path: Path, upper: bool) -> None:
     for name, value in (("frequency_hz", hz), ("damping", damping)):
         e = found.effects[0].parameters[f"channel_mismatch.{name}"]
         assert abs(e.value - value) < 4 * e.stderr < 0.2 * value
+
+
+@pytest.mark.parametrize(
+    ("which", "power", "share"), [("both", 3, -0.01), ("both", 2, 0.02), ("upper", 2, 0.005)]
+)
+def test_microphones_that_bend(tmp_path: Path, which: str, power: int, share: float) -> None:
+    """By that share of the largest pressure there is."""
+    loudest = 1500.0
+    bend = share / loudest ** (power - 1)
+
+    def heard(p: FloatArray) -> FloatArray:
+        bent = p + bend * p**power
+        return bent - bent.mean()
+
+    def bent(run: RecordedRun) -> RecordedRun:
+        assert np.max(np.abs(run.p2)) < loudest
+        p1 = heard(run.p1) if which == "both" else run.p1
+        return replace(run, p1=p1, p2=heard(run.p2))
+
+    ready = altered_campaign(tmp_path, 7, bent)
+    forms = [e for e in CATALOGUE if e.location in ("sensor", "nonlinearity")]
+    found = identify.diagnose(ready.campaign, catalogue=forms)
+    form = {2: "quadratic", 3: "cubic"}[power]
+    names = [(e.effect, e.form) for e in found.effects]
+    form = form if which == "both" else f"{which}_{form}"
+    assert (found.verdict, names) == ("traced", [("sensor_nonlinearity", form)])
+    e = found.effects[0].parameters[f"sensor_nonlinearity.a{power}"]
+    assert abs(e.value - bend) < 4 * e.stderr < 0.1 * abs(bend)
+
+
+def test_noise_is_counted_as_a_large_correction_leaves_it(tmp_path: Path) -> None:
+    """By the noise of the velocity as measured, a gain of 0.6 left χ²/dof 1.7, and was claimed with
+    a mode that was not there."""
+    gain = 0.6
+
+    def heard(run: RecordedRun) -> RecordedRun:
+        return replace(run, p2=run.p2 * gain)
+
+    ready = altered_campaign(tmp_path, 7, heard)
+    found = identify.diagnose(ready.campaign, catalogue=[by_key("channel_mismatch:gain")])
+    assert (found.verdict, [e.effect for e in found.effects]) == ("traced", ["channel_mismatch"])
+    e = found.effects[0].parameters["channel_mismatch.gain"]
+    assert abs(e.value - (gain - 1)) < 4 * e.stderr < 1e-3
+    assert stats.chi2.sf(found.after.chi2_per_dof * found.after.dof, found.after.dof) > 0.01
 
 
 def test_a_spread_must_leave_nothing_but_noise(

@@ -9,15 +9,30 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from identify import dual
 from identify.parameters import Parameter
+from identify.periods import to_harmonics, to_time
 from identify.structure import Conditions, Effect, Known, Mode, Values
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
 
 
 def upper_pressure(at: Conditions, s: Any) -> Any:
     """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
     return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
+
+
+def recorded_s(at: Conditions) -> ComplexArray:
+    """j k ω of the harmonics as recorded, of free runs too."""
+    return np.asarray(1j * at.omega[:, None] * np.arange(1, at.harmonics + 1))
+
+
+def lower_pressure(at: Conditions, s: Any) -> Any:
+    """The same at the lower microphone."""
+    return at.pressure + s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
 
 
 def as_velocity(at: Conditions, s: Any, pressure: Any) -> Any:
@@ -54,7 +69,7 @@ class ChannelMismatch(Effect):
 
     def __init__(self, form: str) -> None:
         self.form = form
-        gain = Parameter("channel_mismatch.gain", "1", -0.5, 0.5, scale=1e-3)
+        gain = Parameter("channel_mismatch.gain", "1", -0.9, 9.0, scale=1e-3)
         skew = Parameter("channel_mismatch.skew_s", "s", -1e-2, 1e-2, scale=1e-6)
         phase = Parameter("channel_mismatch.phase_rad", "rad", -1.0, 1.0, scale=1e-3)
         lag = Parameter("channel_mismatch.lowpass_time_s", "s", -1e-2, 1e-2, scale=1e-6)
@@ -75,6 +90,8 @@ class ChannelMismatch(Effect):
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         small = tuple(p.scale for p in self.parameters)
+        if "gain" in self.form:  # as of another range of a preamplifier
+            return [small, *((gain, *small[1:]) for gain in (-0.65, -0.35, 0.5, 1.5, 4.0))]
         if self.form != "skew":
             return [small]
         # a delay of either, as of a converter that began later
@@ -136,10 +153,63 @@ class MicrophoneResonance(Effect):
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
         w = 2 * np.pi * p[self.parameters[0].name]
         inverse = (s / w + 2.0 * p[self.parameters[1].name]) * (s / w) + 1.0
-        side = 1.0 if self.upper else -1.0
-        half = s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
-        leak = as_velocity(at, s, side * at.pressure - half)
-        return with_leak(at, y, leak * (inverse - 1.0))
+        heard = upper_pressure(at, s) if self.upper else -lower_pressure(at, s)
+        return with_leak(at, y, as_velocity(at, s, heard) * (inverse - 1.0))
+
+
+BENT = {2: ("1/Pa", 1e-2), 3: ("1/Pa²", 1e-4)}  # by the power: a microphone's most, and its unit
+STEPS, FLATTEST = 12, 0.1  # of Newton's method; slope of what a microphone reads, at least
+
+
+class MicrophoneDistortion(Effect):
+    """A microphone bends what it hears, or what amplifies it does: it reads p + a pⁿ, less its
+    mean. Both alike, or one of them.
+    """
+
+    name, location = "sensor_nonlinearity", "sensor"
+    needs = ("pressure",)
+
+    def __init__(self, power: int, which: str) -> None:
+        self.power, self.which = power, which
+        self.form = {"both": "", "upper": "upper_", "lower": "lower_"}[which]
+        self.form += {2: "quadratic", 3: "cubic"}[power]
+        name, (unit, most) = f"sensor_nonlinearity.a{power}", BENT[power]
+        self.parameters = (Parameter(name, unit, -most, most, scale=1e-3 * most),)
+
+    def starts(self, known: Known) -> list[tuple[float, ...]]:
+        pressure = 400.0 * known.velocity_amplitude  # ρc times that, Pa
+        size = 0.01 / pressure ** (self.power - 1)
+        return [(size,), (-size,)]
+
+    def neutral(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
+        a, read_s = p[self.parameters[0].name], recorded_s(at)
+        more: Any = 0.0  # was heard than read, in the upper microphone against the lower
+        if self.which != "lower":
+            more = more + unbent(upper_pressure(at, read_s), a, self.power)
+        if self.which != "upper":
+            more = more - unbent(lower_pressure(at, read_s), a, self.power)
+        return with_leak(at, y, as_velocity(at, s, more))
+
+
+def unbent(read: ComplexArray, a: Any, power: int) -> Any:
+    """Harmonics of what was heard less what was read, of p + a pⁿ less its mean: p of no mean that
+    this is said of, by Newton's method sample by sample."""
+    K = read.shape[1]
+    r, size = to_time(read, K), dual.value(a)
+    p = r
+    for _ in range(STEPS):
+        slope = np.maximum(1.0 + power * size * p ** (power - 1), FLATTEST)
+        error = r - p - size * p**power  # less what it is in the mean
+        p = p + (error - np.mean(error / slope, axis=1, keepdims=True) / _mean(slope)) / slope
+    by_a = (np.mean(p**power / slope, axis=1, keepdims=True) / _mean(slope) - p**power) / slope
+    return to_harmonics(dual.chain(p - r, (by_a, a)), K)
+
+
+def _mean(slope: FloatArray) -> FloatArray:
+    return np.asarray(np.mean(1.0 / slope, axis=1, keepdims=True))
 
 
 class SensorOffset(Effect):
@@ -311,6 +381,7 @@ EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("skew_lowpass"),
     MicrophoneResonance(upper=True),
     MicrophoneResonance(upper=False),
+    *(MicrophoneDistortion(n, which) for which in ("both", "upper", "lower") for n in (2, 3)),
     SensorOffset("propagation"),
     SensorOffset("mode_shapes"),
     ModalOffset(2),

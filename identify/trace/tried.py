@@ -11,7 +11,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from identify import assess
+from identify import assess, corrected
 from identify.dataset import Dataset
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
@@ -51,6 +51,8 @@ class Tried:
     validation_p: float
     spread: Spread | None = None
     held_out: tuple[float, int] = (0.0, 0)  # χ² of those runs, and of how many residuals
+    counted: Dataset | None = None  # with the noise as its effects correct it, where that matters …
+    grown: float = 0.0  # … and by how much ln det of the covariances has grown
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -121,8 +123,8 @@ class Tried:
 
     @property
     def deviance(self) -> float:
-        """χ², and what a spread's likelihood pays for the noise that it widens."""
-        return self.fit.chi2 + (0.0 if self.spread is None else self.spread.penalty)
+        """χ², and what the likelihood pays for noise that is widened."""
+        return self.fit.chi2 + self.grown + (0.0 if self.spread is None else self.spread.penalty)
 
     @property
     def evidence(self) -> float:
@@ -218,11 +220,15 @@ def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
 
 def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
     """A refitted candidate with its adequacy on fitted and held-out runs."""
+    given, grown = data, 0.0
+    if fit.chi2_per_dof < VISIBLE:  # else it does not matter what noise its corrections leave
+        data, fit, grown = corrected.refitted(fit, data)
+    own = None if data is given else data
     fit, held_out = _foreseen(fit, data)
     error = assess.relative_error(held_out) if held_out else float("nan")
     misfit_out = assess.held_out_misfit(held_out, fit.covariance)
     fit_p, p_out = (assess.lack_of_fit_p(*m) for m in ((fit.chi2, fit.dof), misfit_out))
-    return Tried(effects, fit, error, fit_p, p_out, held_out=misfit_out)
+    return Tried(effects, fit, error, fit_p, p_out, held_out=misfit_out, counted=own, grown=grown)
 
 
 def _foreseen(fit: Fit, data: Dataset) -> tuple[Fit, list[assess.Prediction]]:

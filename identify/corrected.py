@@ -1,0 +1,90 @@
+"""The noise of a velocity that is corrected for what its microphones do.
+
+A sensor's effect is formed from the pressures as measured, so that the residual of a run holds
+their noise as the correction passes it on: with the velocity Y and the mean pressure P as read,
+
+    Y − Ŷ = (1 − ∂Ŷ/∂Y) n_Y − ∂Ŷ/∂P n_P      of each harmonic,
+
+whose variance may be twice that of Y's own noise or half of it where two sensitivities differ by
+much. The correlation of harmonics stays as recorded.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from identify.dataset import Batch, Dataset
+from identify.fit import Fit, fit_orbits
+from identify.structure import Conditions, Structure, Values
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
+
+NEGLIGIBLE = 0.03  # of a coefficient's variance
+
+
+def refitted(fit: Fit, data: Dataset) -> tuple[Dataset, Fit, float]:
+    """`data` with the noise of the velocity as `fit` corrects it, `fit` repeated on them, and by
+    how much ln det C of the fitted runs has grown; the same objects and 0 where it is negligible,
+    or where nothing comes of it."""
+    counted, grown = with_corrected_noise(fit, data)
+    if counted is data:
+        return data, fit, 0.0
+    again = fit_orbits(fit.structure, counted, fit.theta, continuation=(0.0,))
+    return (counted, again, grown) if np.isfinite(again.chi2) else (data, fit, 0.0)
+
+
+def with_corrected_noise(fit: Fit, data: Dataset) -> tuple[Dataset, float]:
+    """The data, and by how much ln det C of the fitted runs has grown."""
+    groups = (data.fit, data.validation)
+    found = [[_variance(fit.structure, fit.values, b) for b in group] for group in groups]
+    if all(np.max(np.abs(v - 1)) < NEGLIGIBLE for each in found for v in each):
+        return data, 0.0
+    fitted, held_out = (
+        tuple(_widened(b, v) for b, v in zip(group, each, strict=True))
+        for group, each in zip(groups, found, strict=True)
+    )
+    grown = sum(float(2 * np.log(v).sum()) for v in found[0])
+    return replace(data, fit=fitted, validation=held_out), grown
+
+
+def _variance(structure: Structure, values: Values, batch: Batch) -> FloatArray:
+    """Of each compared coefficient with the correction, over that without it, (runs, K)."""
+    K = batch.compared
+    if batch.pressure_noise is None or not structure.effects:
+        return np.ones((batch.runs, K))
+    at = replace(batch.at, free=np.zeros(batch.runs, dtype=bool))  # in the phase as recorded
+    none = _read(structure, values, at)
+
+    def slope(name: str) -> ComplexArray:
+        changed = replace(at, **{name: getattr(at, name) + 1.0})
+        return np.asarray(_read(structure, values, changed) - none)[:, :K]
+
+    kept, leaked = 1.0 - slope("velocity"), -slope("pressure")
+    found = np.abs(kept) ** 2 * batch.noise + np.abs(leaked) ** 2 * batch.pressure_noise[:, :K]
+    if batch.shared_noise is not None:
+        found += 2 * np.real(kept * leaked.conj() * batch.shared_noise[:, :K])
+    found = found / batch.noise
+    return np.where(np.isfinite(found) & (found > 0), found, 1.0)
+
+
+def _read(structure: Structure, values: Values, at: Conditions) -> ComplexArray:
+    """What the sensors' effects read where nothing moves."""
+    s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
+    y = np.zeros_like(at.velocity)
+    for effect in structure.effects:
+        y = effect.sensor(values, at, s, y)
+    return np.asarray(y)
+
+
+def _widened(batch: Batch, variance: FloatArray) -> Batch:
+    size = np.sqrt(np.tile(variance, 2))
+    if batch.free:
+        size[:, batch.compared] = 1.0  # the frequency's place
+    return replace(
+        batch,
+        covariance=batch.covariance * size[:, :, None] * size[:, None, :],
+        whitener=batch.whitener / size[:, None, :],
+        noise=batch.noise * variance,
+    )
