@@ -30,6 +30,7 @@ from daq.store_file import FLAG_BITS, summarise, write_layout
 from drivers.types import Flag
 
 MAX_QUEUED_BYTES = 256 * 2**20  # some 150 s of 8 channels at 51.2 kHz float32
+DISK_ERRORS = (OSError, RuntimeError)  # HDF5 raises either where a disk is full
 MAX_FILLED_GAP_S = 60.0
 
 
@@ -101,8 +102,8 @@ class RunWriter:
             self._file = h5py.File(partial_path(path), "w", libver="latest", locking=False)
             write_layout(self._file, header, campaign, software_version())
             self._file.swmr_mode = True
-        except OSError as error:
-            raise StoreError(f"{path}: cannot be created ({error})") from error
+        except DISK_ERRORS as error:
+            raise StoreError(f"{path}: cannot be written ({error})") from error
         self._thread = threading.Thread(target=self._work, name=f"writer {path.stem}", daemon=True)
         self._thread.start()
 
@@ -192,7 +193,7 @@ class RunWriter:
             os.replace(partial, self.path)
             if self._durable:
                 sync_folder(self.path.parent)
-        except OSError as error:
+        except DISK_ERRORS as error:
             raise StoreError(f"{self.path}: cannot be completed ({error})") from error
         self._summary = summarise(
             self.header,

@@ -378,8 +378,8 @@ class Known:
 
     def delays(self, cycles: float) -> list[float]:
         """Delays to start from, s, up to so many periods of the free oscillation: their misfit has
-        a minimum every half of one."""
-        return [q / self.free_hz for q in (0.02, 0.08, *np.arange(0.2, cycles, 0.16).tolist())]
+        a minimum every half of one, which then holds one as near to its own as any other does."""
+        return [q / self.free_hz for q in (0.02, 0.08, *np.arange(0.2, cycles, 1 / 6).tolist())]
 
 
 @dataclass(frozen=True)

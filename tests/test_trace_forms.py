@@ -345,8 +345,8 @@ def test_microphones_that_bend(tmp_path: Path, which: str, power: int, share: fl
         return replace(run, p1=p1, p2=heard(run.p2))
 
     ready = altered_campaign(tmp_path, 7, bent)
-    forms = [e for e in CATALOGUE if e.location in ("sensor", "nonlinearity")]
-    found = identify.diagnose(ready.campaign, catalogue=forms)
+    forms = [e for e in CATALOGUE if e.name == "sensor_nonlinearity"]
+    found = identify.diagnose(ready.campaign, catalogue=[*forms, by_key("channel_mismatch:gain")])
     form = {2: "quadratic", 3: "cubic"}[power]
     names = [(e.effect, e.form) for e in found.effects]
     form = form if which == "both" else f"{which}_{form}"

@@ -138,7 +138,7 @@ class ActuatorDelay(Effect):
     parameters = (Parameter("actuator_dynamics.delay_s", "s", 0.0, 0.05, scale=1e-4),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
-        return [(q,) for q in known.delays(cycles=8.0)]
+        return [(q,) for q in known.delays(cycles=4.0)]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,)
