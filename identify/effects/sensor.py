@@ -158,8 +158,8 @@ class MicrophoneResonance(Effect):
 
 
 BENT = {2: ("1/Pa", 1e-2), 3: ("1/Pa²", 1e-4)}  # by the power: a microphone's most, and its unit
-STEPS, FLATTEST, LOUDEST = 12, 0.1, 3.0  # of Newton's method; least slope of what is read, and …
-# … most of what is heard, times what is read: beyond, no microphone is that bent
+STEPS, EXACT = 12, 1e-12  # of Newton's method, and its last, of the loudest
+FLATTEST, LOUDEST = 0.1, 3.0  # least slope of what is read, and most heard of what is: no more bent
 
 
 class MicrophoneDistortion(Effect):
@@ -204,8 +204,10 @@ def unbent(read: ComplexArray, a: Any, power: int) -> Any:
     for _ in range(STEPS):
         slope = np.maximum(1.0 + power * size * p ** (power - 1), FLATTEST)
         error = r - p - size * p**power  # less what it is in the mean
-        p = p + (error - np.mean(error / slope, axis=1, keepdims=True) / _mean(slope)) / slope
-        p = np.clip(p, -loudest, loudest)  # where no p fits, none runs away
+        step = (error - np.mean(error / slope, axis=1, keepdims=True) / _mean(slope)) / slope
+        p = np.clip(p + step, -loudest, loudest)  # where no p fits, none runs away
+        if np.all(np.abs(step) < EXACT * loudest):
+            break
     by_a = (np.mean(p**power / slope, axis=1, keepdims=True) / _mean(slope) - p**power) / slope
     return to_harmonics(dual.chain(p - r, (by_a, a)), K)
 
