@@ -341,8 +341,8 @@ def _offset(metres: float) -> Numbers:
 
 
 def _bends(share: float, power: int) -> Callable[[FloatArray], FloatArray]:
-    """A microphone that adds such a power of what it hears, by that share at 800 Pa."""
-    return lambda p: p + share * p * (p / 800) ** (power - 1)
+    """A microphone that adds such a power of what it hears, by that share at 4 kPa."""
+    return lambda p: p + share * p * (p / 4000) ** (power - 1)
 
 
 BASE = Tube()

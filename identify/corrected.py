@@ -22,6 +22,7 @@ ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 
 NEGLIGIBLE = 0.03  # of a coefficient's variance
+NUDGE = 1e-4  # of the largest harmonic: small to a microphone that bends
 
 
 def refitted(fit: Fit, data: Dataset) -> tuple[Dataset, Fit, float]:
@@ -52,14 +53,16 @@ def with_corrected_noise(fit: Fit, data: Dataset) -> tuple[Dataset, float]:
 def _variance(structure: Structure, values: Values, batch: Batch) -> FloatArray:
     """Of each compared coefficient with the correction, over that without it, (runs, K)."""
     K = batch.compared
-    if batch.pressure_noise is None or not structure.effects:
+    if batch.pressure_noise is None or not structure.effects or not np.any(batch.at.pressure):
         return np.ones((batch.runs, K))
     at = replace(batch.at, free=np.zeros(batch.runs, dtype=bool))  # in the phase as recorded
     none = _read(structure, values, at)
 
     def slope(name: str) -> ComplexArray:
-        changed = replace(at, **{name: getattr(at, name) + 1.0})
-        return np.asarray(_read(structure, values, changed) - none)[:, :K]
+        x = getattr(at, name)
+        nudge = NUDGE * np.max(np.abs(x))
+        changed = replace(at, **{name: x + nudge})
+        return np.asarray((_read(structure, values, changed) - none) / nudge)[:, :K]
 
     kept, leaked = 1.0 - slope("velocity"), -slope("pressure")
     found = np.abs(kept) ** 2 * batch.noise + np.abs(leaked) ** 2 * batch.pressure_noise[:, :K]
