@@ -90,7 +90,8 @@ def data_of(modes: int, runs: int) -> tuple[Structure, FloatArray, Dataset]:
                 velocity=orbits.velocity[i] + n, drive=at.drive[i],
                 pressure=np.zeros(K, dtype=complex), covariance=np.eye(2 * K) * size**2 / 2,
                 side=np.zeros((2, K), dtype=complex), pressure_noise=np.zeros(K),
-                drive_variance=0.0, started_s=60.0 * i, duration_s=1.0,
+                shared_noise=np.zeros(K, dtype=complex), drive_variance=0.0,
+                started_s=60.0 * i, duration_s=1.0,
                 nominal_hz=None, amplitude_v=float(abs(at.drive[i, 0])),
             )
         )  # fmt: skip

@@ -488,10 +488,6 @@ def _other_gain(gain: float, skew_s: float = 0.0) -> Callable[[FloatArray], Any]
     return lambda f: (1 + gain) * np.exp(2j * np.pi * skew_s * f)
 
 
-def _both(microphone: Callable[[FloatArray], FloatArray]) -> dict[str, Any]:
-    return {"microphones": (microphone, microphone)}
-
-
 DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
     "acoustic_mode/third": lambda r: {"modes": 3},
     "acoustic_mode/two": lambda r: {"modes": 4},
@@ -530,9 +526,9 @@ DRAWN: dict[str, Callable[[Random], dict[str, Any]]] = {
     "channel_mismatch/resonance": lambda r: {
         "upper_microphone": _heard_through(_size(r, 1200, 8000), _size(r, 0.05, 0.7))
     },
-    "sensor_nonlinearity/both": lambda r: _both(
-        _bends(_signed(r, 1e-3, 0.1), int(r.integers(2, 4)))
-    ),
+    "sensor_nonlinearity/both": lambda r: {
+        "microphones": (_bends(_signed(r, 1e-3, 0.1), int(r.integers(2, 4))),) * 2
+    },
     "sensor_nonlinearity/upper": lambda r: {
         "microphones": (lambda p: p, _bends(_signed(r, 1e-4, 0.02), int(r.integers(2, 4))))
     },

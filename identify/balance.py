@@ -139,7 +139,7 @@ def _inputs_from_velocity(
 ) -> ComplexArray:
     """Nonlinearity inputs implied by the measured velocity: the start on the measured branch."""
     values = structure.parameters.by_name(columns)
-    s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
+    s = at.s
     with np.errstate(all="ignore"):
         y = at_the_flame(structure.effects, values, at, s)
         y = np.where(np.isfinite(y), y, at.velocity)
@@ -291,7 +291,7 @@ def _sampled_newton(
 
 def residual(structure: Structure, values: Values, at: Conditions, v: ComplexArray) -> ComplexArray:
     """The balance R of forced runs at any inputs `v`, both (loops, runs, K)."""
-    s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
+    s = at.s
     loop = structure.assemble(values, at, s)
     return np.stack(
         _balance(loop, v, [_force(n, x, at.harmonics) for n, x in zip(loop.N, v, strict=True)])

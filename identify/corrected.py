@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Batch, Dataset
-from identify.fit import Fit, fit_orbits
+from identify.fit import Fit, repeated
 from identify.structure import Conditions, Structure, Values
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -25,29 +25,29 @@ NEGLIGIBLE = 0.03  # of a coefficient's variance
 NUDGE = 1e-4  # of the largest harmonic: small to a microphone that bends
 
 
-def refitted(fit: Fit, data: Dataset) -> tuple[Dataset, Fit, float]:
-    """`data` with the noise of the velocity as `fit` corrects it, `fit` repeated on them, and by
-    how much ln det C of the fitted runs has grown; the same objects and 0 where it is negligible,
-    or where nothing comes of it."""
-    counted, grown = with_corrected_noise(fit, data)
-    if counted is data:
-        return data, fit, 0.0
-    again = fit_orbits(fit.structure, counted, fit.theta, continuation=(0.0,))
-    return (counted, again, grown) if np.isfinite(again.chi2) else (data, fit, 0.0)
+def refitted(fit: Fit, data: Dataset) -> tuple[Dataset, Fit]:
+    """`data` with the noise of the velocity as `fit` corrects it, and `fit` repeated on them; the
+    same objects where it is negligible, or where nothing comes of it."""
+    return repeated(fit, data, with_corrected_noise(fit, data))
 
 
-def with_corrected_noise(fit: Fit, data: Dataset) -> tuple[Dataset, float]:
-    """The data, and by how much ln det C of the fitted runs has grown."""
+def with_corrected_noise(fit: Fit, data: Dataset) -> Dataset:
+    """`data` with the correction in every covariance; the same object where it is negligible."""
     groups = (data.fit, data.validation)
     found = [[_variance(fit.structure, fit.values, b) for b in group] for group in groups]
     if all(np.max(np.abs(v - 1)) < NEGLIGIBLE for each in found for v in each):
-        return data, 0.0
+        return data
     fitted, held_out = (
         tuple(_widened(b, v) for b, v in zip(group, each, strict=True))
         for group, each in zip(groups, found, strict=True)
     )
-    grown = sum(float(2 * np.log(v).sum()) for v in found[0])
-    return replace(data, fit=fitted, validation=held_out), grown
+    return replace(data, fit=fitted, validation=held_out)
+
+
+def growth(counted: Dataset, data: Dataset) -> float:
+    """By how much ln det C of the fitted runs has grown from `data` to `counted`."""
+    pairs = zip(counted.fit, data.fit, strict=True)
+    return sum(float(2 * np.log(new.noise / old.noise).sum()) for new, old in pairs)
 
 
 def _variance(structure: Structure, values: Values, batch: Batch) -> FloatArray:
@@ -74,10 +74,9 @@ def _variance(structure: Structure, values: Values, batch: Batch) -> FloatArray:
 
 def _read(structure: Structure, values: Values, at: Conditions) -> ComplexArray:
     """What the sensors' effects read where nothing moves."""
-    s = 1j * at.omega[:, None] * np.arange(1, at.harmonics + 1)
     y = np.zeros_like(at.velocity)
     for effect in structure.effects:
-        y = effect.sensor(values, at, s, y)
+        y = effect.sensor(values, at, at.s, y)
     return np.asarray(y)
 
 

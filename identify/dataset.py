@@ -248,9 +248,7 @@ def _batch(
         started_s=np.array([h.started_s for h in hs]),
         drive_noise=np.array([h.drive_variance for h in hs]),
         pressure_noise=pad([h.pressure_noise for h in hs]).real,
-        shared_noise=pad([h.shared_noise for h in hs if h.shared_noise is not None])
-        if all(h.shared_noise is not None for h in hs)
-        else None,
+        shared_noise=pad([h.shared_noise for h in hs]),
     )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from identify import balance
 from identify.dataset import Batch, Dataset, whitener
-from identify.fit import Fit, fit_orbits
+from identify.fit import Fit, repeated
 
 NEGLIGIBLE = 1e-3  # of a coefficient's own variance
 
@@ -27,11 +27,7 @@ def refitted(fit: Fit, data: Dataset, model: Fit | None = None) -> tuple[Dataset
 
     As recorded: covariances that hold the drive's share already would get it twice.
     """
-    counted = with_uncertain_drive(model or fit, data)
-    if counted is data:
-        return data, fit
-    again = fit_orbits(fit.structure, counted, fit.theta, continuation=(0.0,))
-    return (counted, again) if np.isfinite(again.chi2) else (data, fit)
+    return repeated(fit, data, with_uncertain_drive(model or fit, data))
 
 
 def with_uncertain_drive(fit: Fit, data: Dataset) -> Dataset:

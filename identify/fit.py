@@ -709,6 +709,15 @@ def _another_sings(fit: Fit) -> FloatArray | None:
     return theta
 
 
+def repeated(fit: Fit, data: Dataset, counted: Dataset) -> tuple[Dataset, Fit]:
+    """`counted`, which is `data` with other covariances, and `fit` repeated on them; `data` and
+    `fit` themselves where they are the same, or where nothing comes of it."""
+    if counted is data:
+        return data, fit
+    again = fit_orbits(fit.structure, counted, fit.theta, continuation=(0.0,))
+    return (counted, again) if np.isfinite(again.chi2) else (data, fit)
+
+
 def _from_each(
     structure: Structure,
     data: Dataset,

@@ -70,12 +70,12 @@ class Harmonics:
     covariance: FloatArray
     side: ComplexArray
     pressure_noise: FloatArray
+    shared_noise: ComplexArray
     drive_variance: float
     started_s: float
     duration_s: float
     nominal_hz: float | None
     amplitude_v: float | None
-    shared_noise: ComplexArray | None = None
 
     @property
     def count(self) -> int:
@@ -108,7 +108,7 @@ class Harmonics:
             covariance=self.covariance[np.ix_(keep, keep)],
             side=self.side[:, :count],
             pressure_noise=self.pressure_noise[:count],
-            shared_noise=None if self.shared_noise is None else self.shared_noise[:count],
+            shared_noise=self.shared_noise[:count],
         )
 
 
@@ -201,7 +201,7 @@ def measure(
             )
     if mics is None:
         velocity, pressure = c[0], np.zeros(K, dtype=complex)
-        noise, pressure_noise, shared_noise = side[0], np.zeros(K), None
+        noise, pressure_noise, shared_noise = side[0], np.zeros(K), np.zeros(K, dtype=complex)
         coarse = np.full(K, hidden[0])
     else:
         offset = 2 * np.pi * side_offsets(run.duration_s)[:, None]
@@ -242,12 +242,12 @@ def measure(
         covariance=covariance,
         side=noise,
         pressure_noise=pressure_noise,
+        shared_noise=shared_noise,
         drive_variance=float(np.mean(np.abs(side[-1][:, 0]) ** 2) + hidden[-1]),
         started_s=run.started_s,
         duration_s=run.duration_s,
         nominal_hz=run.frequency_hz,
         amplitude_v=run.amplitude_v,
-        shared_noise=shared_noise,
     )
 
 

@@ -113,7 +113,7 @@ def identify(
     ready = prepare(campaign, structure)
     report(0.2, "fitting the declared model")
     fit = fit_structure(ready.structure, ready.data)
-    data, fit, _ = corrected.refitted(fit, ready.data)
+    data, fit = corrected.refitted(fit, ready.data)
     data, fit = drive.refitted(fit, data)
     report(0.9, "validating")
     assessment = replace(assess.assess(fit, data), lock_in=assess.lock_in((fit, data)))

@@ -286,7 +286,7 @@ def corrected(data: Dataset, effects: Sequence[Effect], p: Values) -> Dataset | 
     """
 
     def clean(b: Batch) -> Batch:
-        s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
+        s = b.at.s
         drive, y = driven(effects, p, b.at, b.at.drive), at_the_flame(effects, p, b.at, s)
         for e in effects:
             drive = e.actuator(p, b.at, s) * drive
@@ -326,7 +326,7 @@ def slow_flow(data: Dataset, effects: Sequence[Effect] = (), p: Values | None = 
     rows, right, w0 = [], [], 2 * np.pi * data.free_hz
     phase = 1.0 + 0j
     for b in data.fit:
-        s = 1j * b.at.omega[:, None] * np.arange(1, b.at.harmonics + 1)
+        s = b.at.s
         drive, y = driven(effects, p, b.at, b.at.drive), at_the_flame(effects, p, b.at, s)
         modes = [Mode(1.0, 1.0, 1.0, 1.0)]
         for e in effects:

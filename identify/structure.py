@@ -91,6 +91,11 @@ class Conditions:
         return self._tiled[times]
 
     @cached_property
+    def s(self) -> ComplexArray:
+        """j k ω of each harmonic, (runs, harmonics); of free runs near their frequency."""
+        return np.asarray(1j * self.omega[:, None] * np.arange(1, self.harmonics + 1))
+
+    @cached_property
     def _tiled(self) -> dict[int, "Conditions"]:
         return {}
 

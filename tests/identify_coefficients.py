@@ -41,7 +41,7 @@ def clean(conditions: tuple[tuple[float, float], ...], noise: float) -> Dataset:
             name=f"{f:g}", kind="forced", role="fit", frequency_hz=f, frequency_stderr_hz=0.0,
             velocity=y, drive=u, pressure=np.zeros(K, dtype=complex),
             covariance=np.eye(2 * K) * size**2 / 2, side=np.zeros((2, K), dtype=complex),
-            pressure_noise=np.zeros(K), drive_variance=0.0,
+            pressure_noise=np.zeros(K), shared_noise=np.zeros(K, dtype=complex), drive_variance=0.0,
             started_s=60.0 * (3 * i % n),
             duration_s=1.0, nominal_hz=f, amplitude_v=a,
         )

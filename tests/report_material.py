@@ -121,6 +121,7 @@ def harmonics(structure: Structure, theta: FloatArray, noise: float = 1e-4) -> l
                 covariance=np.eye(2 * K) * size**2 / 2,
                 side=np.zeros((40, K), dtype=complex),
                 pressure_noise=np.zeros(K),
+                shared_noise=np.zeros(K, dtype=complex),
                 drive_variance=0.0,
                 started_s=started,
                 duration_s=2.0,

@@ -70,6 +70,7 @@ def solved(options: tuple[Option, ...], effect: str, value: float) -> list[Harmo
             covariance=np.eye(2 * K) * NOISE**2 / 2,
             side=np.zeros((40, K), dtype=complex),
             pressure_noise=np.zeros(K),
+            shared_noise=np.zeros(K, dtype=complex),
             drive_variance=0.0,
             started_s=60.0 * i,
             duration_s=2.0,

@@ -22,17 +22,16 @@ FloatArray = npt.NDArray[np.float64]
 
 def upper_pressure(at: Conditions, s: Any) -> Any:
     """Measured pressure at the upper microphone, from the mean pressure and the velocity."""
-    return at.pressure - s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
-
-
-def recorded_s(at: Conditions) -> ComplexArray:
-    """j k ω of the harmonics as recorded, of free runs too."""
-    return np.asarray(1j * at.omega[:, None] * np.arange(1, at.harmonics + 1))
+    return at.pressure - _half_the_difference(at, s)
 
 
 def lower_pressure(at: Conditions, s: Any) -> Any:
     """The same at the lower microphone."""
-    return at.pressure + s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
+    return at.pressure + _half_the_difference(at, s)
+
+
+def _half_the_difference(at: Conditions, s: Any) -> Any:
+    return s * (0.5 * at.density_kg_m3 * at.spacing_m[:, None]) * at.velocity
 
 
 def as_velocity(at: Conditions, s: Any, pressure: Any) -> Any:
@@ -186,12 +185,12 @@ class MicrophoneDistortion(Effect):
         return (0.0,)
 
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
-        a, read_s = p[self.parameters[0].name], recorded_s(at)
+        a = p[self.parameters[0].name]
         more: Any = 0.0  # was heard than read, in the upper microphone against the lower
         if self.which != "lower":
-            more = more + unbent(upper_pressure(at, read_s), a, self.power)
+            more = more + unbent(upper_pressure(at, at.s), a, self.power)
         if self.which != "upper":
-            more = more - unbent(lower_pressure(at, read_s), a, self.power)
+            more = more - unbent(lower_pressure(at, at.s), a, self.power)
         return with_leak(at, y, as_velocity(at, s, more))
 
 
@@ -203,17 +202,16 @@ def unbent(read: ComplexArray, a: Any, power: int) -> Any:
     p, loudest = r, LOUDEST * np.max(np.abs(r))
     for _ in range(STEPS):
         slope = np.maximum(1.0 + power * size * p ** (power - 1), FLATTEST)
-        error = r - p - size * p**power  # less what it is in the mean
-        step = (error - np.mean(error / slope, axis=1, keepdims=True) / _mean(slope)) / slope
+        step = _of_no_mean(r - p - size * p**power, slope)
         p = np.clip(p + step, -loudest, loudest)  # where no p fits, none runs away
         if np.all(np.abs(step) < EXACT * loudest):
             break
-    by_a = (np.mean(p**power / slope, axis=1, keepdims=True) / _mean(slope) - p**power) / slope
-    return to_harmonics(dual.chain(p - r, (by_a, a)), K)
+    return to_harmonics(dual.chain(p - r, (-_of_no_mean(p**power, slope), a)), K)
 
 
-def _mean(slope: FloatArray) -> FloatArray:
-    return np.asarray(np.mean(1.0 / slope, axis=1, keepdims=True))
+def _of_no_mean(x: FloatArray, slope: FloatArray) -> FloatArray:
+    """(x − c)/slope, c such that its mean vanishes."""
+    return (x - np.average(x, axis=1, weights=1.0 / slope, keepdims=True)) / slope
 
 
 class SensorOffset(Effect):

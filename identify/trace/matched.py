@@ -33,7 +33,7 @@ def matched(
         parts, slopes = [], []
         for b in data.fit:
             given = replace(b.at, drive=np.ones_like(b.at.drive))
-            s = 1j * given.omega[:, None] * np.arange(1, given.harmonics + 1)
+            s = given.s
             loop = structure.assemble(structure.parameters.seeded(at[None], b.runs), given, s)
             for x in (loop.G[0], loop.G_u, loop.H):
                 parts.append(np.broadcast_to(dual.value(x), s.shape).ravel())

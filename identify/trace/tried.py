@@ -220,10 +220,11 @@ def key_of_forms(effects: Sequence[Effect]) -> tuple[str, ...]:
 
 def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
     """A refitted candidate with its adequacy on fitted and held-out runs."""
-    given, grown = data, 0.0
+    own, grown = None, 0.0
     if fit.chi2_per_dof < VISIBLE:  # else it does not matter what noise its corrections leave
-        data, fit, grown = corrected.refitted(fit, data)
-    own = None if data is given else data
+        counted, fit = corrected.refitted(fit, data)
+        if counted is not data:
+            own, grown, data = counted, corrected.growth(counted, data), counted
     fit, held_out = _foreseen(fit, data)
     error = assess.relative_error(held_out) if held_out else float("nan")
     misfit_out = assess.held_out_misfit(held_out, fit.covariance)

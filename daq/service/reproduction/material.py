@@ -99,6 +99,7 @@ def dataset_of(runs: EntrainedRuns, size: float, compared: int) -> Dataset:
                 covariance=np.eye(2 * K) * (size * 1e-7) ** 2 / 2,
                 side=np.zeros((2, K), dtype=complex),
                 pressure_noise=np.zeros(K),
+                shared_noise=np.zeros(K, dtype=complex),
                 drive_variance=0.0,
                 started_s=0.0,
                 duration_s=1.0,
