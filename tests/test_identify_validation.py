@@ -140,7 +140,8 @@ def test_a_fit_that_is_lost_with_an_uncertain_drive_is_kept_as_it_was(
     counted, again = drive.refitted(fit, told)
     assert counted is not told
     assert again is not fit
-    monkeypatch.setattr(drive, "fit_orbits", lambda s, d, t, **_: failed(s, d, t, "lost"))
+    lost = "identify.fit.fit_orbits"
+    monkeypatch.setattr(lost, lambda s, d, t, **_: failed(s, d, t, "lost"))
     kept = drive.refitted(fit, told)
     assert kept[0] is told
     assert kept[1] is fit
