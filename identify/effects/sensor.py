@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
+from identify.effects.heard import unbent
 from identify.parameters import Parameter
-from identify.periods import to_harmonics, to_time
 from identify.structure import Conditions, Effect, Known, Mode, Values
 
 ComplexArray = npt.NDArray[np.complex128]
@@ -157,8 +157,6 @@ class MicrophoneResonance(Effect):
 
 
 BENT = {2: ("1/Pa", 1e-2), 3: ("1/Pa²", 1e-4)}  # by the power: a microphone's most, and its unit
-STEPS, EXACT = 12, 1e-12  # of Newton's method, and its last, of the loudest
-FLATTEST, LOUDEST = 0.1, 3.0  # least slope of what is read, and most heard of what is: no more bent
 
 
 class MicrophoneDistortion(Effect):
@@ -192,26 +190,6 @@ class MicrophoneDistortion(Effect):
         if self.which != "upper":
             more = more - unbent(lower_pressure(at, at.s), a, self.power)
         return with_leak(at, y, as_velocity(at, s, more))
-
-
-def unbent(read: ComplexArray, a: Any, power: int) -> Any:
-    """Harmonics of what was heard less what was read, of p + a pⁿ less its mean: p of no mean that
-    this is said of, by Newton's method sample by sample."""
-    K = read.shape[1]
-    r, size = to_time(read, K), dual.value(a)
-    p, loudest = r, LOUDEST * np.max(np.abs(r))
-    for _ in range(STEPS):
-        slope = np.maximum(1.0 + power * size * p ** (power - 1), FLATTEST)
-        step = _of_no_mean(r - p - size * p**power, slope)
-        p = np.clip(p + step, -loudest, loudest)  # where no p fits, none runs away
-        if np.all(np.abs(step) < EXACT * loudest):
-            break
-    return to_harmonics(dual.chain(p - r, (-_of_no_mean(p**power, slope), a)), K)
-
-
-def _of_no_mean(x: FloatArray, slope: FloatArray) -> FloatArray:
-    """(x − c)/slope, c such that its mean vanishes."""
-    return (x - np.average(x, axis=1, weights=1.0 / slope, keepdims=True)) / slope
 
 
 class SensorOffset(Effect):
