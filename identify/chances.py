@@ -18,14 +18,19 @@ def chi2_tail(x: float, dof: float) -> float:
     return float(special.chdtrc(dof, max(x, 0.0)))
 
 
-def chi2_tails(x: npt.NDArray[np.float64], dof: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
-    """The same for arrays that broadcast."""
-    return np.asarray(special.chdtrc(dof, np.maximum(x, 0.0)))
+def chi2_points(p: float, dof: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """What χ² with so many degrees of freedom each exceeds with probability p."""
+    return np.asarray(special.chdtri(dof, p))
 
 
 def f_tail(x: float, dof_above: float, dof_below: float) -> float:
     """P(F > x) of Fisher's ratio."""
     return float(special.fdtrc(dof_above, dof_below, max(x, 0.0)))
+
+
+def beta_tail(x: float, a: float, b: float) -> float:
+    """P(X > x) of a Beta(a, b): of one square's share in a sum of n, a = 1/2, b = (n − 1)/2."""
+    return float(special.betaincc(a, b, x))
 
 
 def rank_correlation(a: npt.ArrayLike, b: npt.ArrayLike) -> tuple[float, float]:

@@ -20,10 +20,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize, stats
 
 from identify import assess
-from identify.chances import rank_correlation
+from identify.chances import beta_tail, rank_correlation
 from identify.dataset import Batch, Dataset
 from identify.effects.scatter import Scatter
 from identify.fit import Fit, resolved
@@ -306,6 +305,8 @@ def _penalty(rows: Sequence[_Rows], sizes: FloatArray) -> float:
 
 
 def _sizes(rows: Sequence[_Rows], start: FloatArray) -> FloatArray:
+    from scipy import optimize  # a third of a second that only a spread costs
+
     def deviance(logs: FloatArray) -> float:
         return _deviance(rows, np.exp(np.clip(logs, np.log(SMALLEST), 0.0)))
 
@@ -349,7 +350,7 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> tu
     doubts: list[tuple[float, str]] = []
     for name, own in zip(names, x[:, there].T, strict=True):
         share = float(np.max(own**2) / np.sum(own**2))
-        p_value = own.size * float(stats.beta.sf(share, 0.5, (own.size - 1) / 2))
+        p_value = own.size * beta_tail(share, 0.5, (own.size - 1) / 2)
         if share > ONE_RUN and p_value < TREND_P:
             doubts.append((p_value, f"{name}: a single run deviates (p {p_value:.1g})"))
         for word in ranked:

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from daq.cli import app
 from daq.importers import open_campaign
-from identify.chances import chi2_tail, f_tail, rank_correlation
+from identify.chances import beta_tail, chi2_points, chi2_tail, f_tail, rank_correlation
 from identify.declare import ModelError, described, read_model, structure_of
 from identify.effects import CATALOGUE
 from identify.harmonics import RecordError
@@ -146,6 +146,9 @@ def test_tails_and_ranks_are_scipy_s() -> None:
     for x, k in ((0.4, 3.0), (88.2, 61.4), (900.0, 5.0), (-1.0, 2.0)):
         assert chi2_tail(x, k) == pytest.approx(stats.chi2.sf(x, k), rel=1e-10)
     assert f_tail(2.2, 3, 40) == pytest.approx(stats.f.sf(2.2, 3, 40), rel=1e-10)
+    assert beta_tail(0.8, 0.5, 4.5) == pytest.approx(stats.beta.sf(0.8, 0.5, 4.5), rel=1e-10)
+    dof = np.array([1, 2, 7])
+    assert chi2_points(1e-4, dof) == pytest.approx(stats.chi2.isf(1e-4, dof), rel=1e-10)
     a, b = [1.0, 2.0, 2.0, 3.0, 5.0, 5.0, 7.0, 0.0], [2.0, 1.0, 4.0, 4.0, 3.0, 8.0, 9.0, 7.0]
     assert rank_correlation(a, b) == pytest.approx(tuple(stats.spearmanr(a, b)), rel=1e-10)
 

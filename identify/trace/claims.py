@@ -8,9 +8,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
-from identify.chances import chi2_tail
+from identify.chances import chi2_tail, f_tail
 from identify.effects import CATALOGUE
 from identify.fit import Fit
 from identify.results import Candidate
@@ -149,7 +148,7 @@ def _beside_chance_p(t: Tried, alone: Tried) -> float:
     if gain <= 0 or count <= freedom:
         return 1.0
     ratio = float(np.expm1(min(gain / count, 500.0))) * (count - freedom) / freedom
-    return min(1.0, float(stats.f.sf(ratio, freedom, count - freedom)) * len(CATALOGUE))
+    return min(1.0, f_tail(ratio, freedom, count - freedom) * len(CATALOGUE))
 
 
 def accounts(t: Tried, declared: Tried, tries: Sequence[Tried]) -> bool:

@@ -5,7 +5,6 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
 
 from identify import dual
 from identify.dataset import Dataset
@@ -24,6 +23,8 @@ def matched(
     """Unknowns of `larger` with which it responds as `fit` does at the measured harmonics, from
     `theta`: its last effect's, and those whose names begin with `moving`, which stay nearby. None
     where the responses cannot be brought within a tenth."""
+    from scipy.optimize import least_squares  # a third of a second that only this costs
+
     names = larger.parameters.names
     own = {q.name for q in larger.effects[-1].parameters}
     free = [i for i, n in enumerate(names) if n.startswith(moving) or n in own]
