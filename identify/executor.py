@@ -10,7 +10,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import get_all_start_methods, get_context, parent_process
 from multiprocessing.context import BaseContext
 from typing import Any, ParamSpec, Protocol, TypeVar
@@ -89,13 +89,20 @@ def executor(processes: int = 1, dask_address: str | None = None) -> Iterator[Ex
         yield InProcess()
         return
     with ProcessPoolExecutor(count, mp_context=_context(), initializer=_prepare) as pool:
-        for _ in range(count):  # workers start at once, beside what comes before the first map
-            pool.submit(os.getpid)
+        threading.Thread(target=_start, args=(pool, count), daemon=True).start()
         try:
             yield _Pool(pool)
         except BaseException:  # cancelled or failed: what has not begun never begins
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+
+
+def _start(pool: ProcessPoolExecutor, count: int) -> None:
+    """Workers start at once, beside what comes before the first map: what they need takes seconds
+    to load, for which whoever starts them waits."""
+    with suppress(RuntimeError):  # all was over before
+        for _ in range(count):
+            pool.submit(os.getpid)
 
 
 def _context() -> BaseContext:
