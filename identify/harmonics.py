@@ -89,11 +89,14 @@ class Harmonics:
 
     def doubted(self, factor: float, error: float = 0.0) -> "Harmonics":
         """The same with `factor` times the standard errors, and a relative `error` of harmonic k
-        that grows with k."""
-        wrong = error * np.arange(1, self.count + 1) * np.abs(self.velocity)
+        that grows with k, and is the same of velocity and pressure."""
+        wrong = (error * np.arange(1, self.count + 1)) ** 2
+        own, shared = np.abs(self.velocity) ** 2, self.velocity * self.pressure.conj()
         return replace(
             self,
-            covariance=self.covariance * factor**2 + np.diag(np.tile(wrong**2 / 2, 2)),
+            covariance=self.covariance * factor**2 + np.diag(np.tile(wrong * own / 2, 2)),
+            pressure_noise=self.pressure_noise * factor**2 + wrong * np.abs(self.pressure) ** 2,
+            shared_noise=self.shared_noise * factor**2 + wrong * shared,
             frequency_stderr_hz=self.frequency_stderr_hz * factor,
         )
 

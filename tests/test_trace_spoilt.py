@@ -7,6 +7,7 @@ import pytest
 
 import identify
 from identify.effects import by_key
+from identify.harmonics import Harmonics
 from identify.identification import DOUBT
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
@@ -41,5 +42,15 @@ def test_a_doubted_run_errs_by_its_noise_and_by_what_spoils_it(tmp_path: Path) -
     k = np.arange(1, h.count + 1)
     noise = DOUBT**2 * h.variance
     np.testing.assert_allclose(h.doubted(DOUBT).variance, noise)
+    wrong = h.doubted(DOUBT, 0.01)
     expected = noise + (0.01 * k * np.abs(h.velocity)) ** 2
-    np.testing.assert_allclose(h.doubted(DOUBT, 0.01).variance, expected)
+    np.testing.assert_allclose(wrong.variance, expected)
+    # of the velocity a·Y + b·P, as a correction leaves it, likewise
+    a, b = 0.9, 0.2j * np.abs(h.velocity).max() / np.abs(h.pressure).max()
+
+    def corrected(h: Harmonics) -> np.ndarray:
+        shared = 2 * np.real(a * np.conj(b) * h.shared_noise)
+        return a**2 * h.variance + np.abs(b) ** 2 * h.pressure_noise + shared
+
+    left = DOUBT**2 * corrected(h) + (0.01 * k * np.abs(a * h.velocity + b * h.pressure)) ** 2
+    np.testing.assert_allclose(corrected(wrong), left)
