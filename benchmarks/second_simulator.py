@@ -103,6 +103,9 @@ class Tube:
     rate_bend: float = 0.0  # of the flame's rate, by q²
     memory: tuple[float, float] = (0.0, 0.0)  # share of the linear term, 1/level (Bouc and Wen)
     stiffness: float = 0.0  # of mode 1's spring, by η²
+    later_when_strong: float = 0.0  # more of the delay, by q²
+    carried: tuple[float, float] = (0.0, 1e-3)  # share of the flame's force, and when, s
+    hum_v: float = 0.0  # of 50 Hz at the speaker
     heating: float = 0.0  # of the voice coil: gain lost by V², without harmonics
     crosstalk: float = 0.0  # Pa in the upper channel by V of the drive
     microphones: tuple[Callable[[FloatArray], FloatArray], ...] = ()  # what each makes of Pa
@@ -110,9 +113,26 @@ class Tube:
 
 
 @numba.njit(cache=True)
+def _earlier(past, i, part, delay):  # type: ignore[no-untyped-def]
+    """What was so long before step i and a part, of a ring of samples up to step i."""
+    where = i + part - delay / H
+    at = int(np.floor(where))
+    if at < 2:
+        return 0.0
+    n, t = past.size, where - at
+    p1, p2 = past[at % n], past[(at + 1) % n]
+    if at + 2 > i:  # linear at the newest, else cubic between four
+        return p1 + t * (p2 - p1)
+    p0, p3 = past[(at - 1) % n], past[(at + 2) % n]
+    bend = 2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)
+    return p1 + 0.5 * t * (p2 - p0 + t * bend)
+
+
+@numba.njit(cache=True)
 def _integrate(  # type: ignore[no-untyped-def]
     count, skip, w0, zeta, psi, D, psi_a, rate, gain, c, level, bent, filt, delay, loss, power,
-    of_all, force, omega, modulation, rate_bend, memory, inverse_level, stiffness,
+    of_all, force, omega, modulation, rate_bend, memory, inverse_level, stiffness, late_bend,
+    carried, carried_delay, hum,
 ):  # fmt: skip
     """Each mode's η and η' over `count` steps after `skip`, (2, count, modes). The state is η,
     η' − ψ f(q), q, the filter's two and a memory of q; so that no derivative of the characteristic
@@ -122,8 +142,7 @@ def _integrate(  # type: ignore[no-untyped-def]
     x, xx, k = np.zeros(n), np.zeros(n), np.zeros((4, n))
     x[0], x[2 * m] = 1.0, 300.0
     speed, out = np.zeros(m), np.zeros((2, count, m))
-    length = int(delay / H) + 4
-    past = np.zeros(length + 2)
+    past, forces = np.zeros(int(3 * delay / H) + 6), np.zeros(int(carried_delay / H) + 6)
     b0, b1, b2, a0, a1 = filt
     for i in range(skip + count):
         for stage in range(4):
@@ -135,32 +154,25 @@ def _integrate(  # type: ignore[no-untyped-def]
             linear += memory * (xx[2 * m + 3] - q)
             f = c[0] * linear + c[1] * q**2 + c[2] * q**3 + c[3] * q**5 - bent * abs(q) * q
             f *= 1.0 + modulation[i]
+            if stage == 0:
+                forces[i % forces.size] = f
+            if carried:
+                f += carried * _earlier(forces, i, part, carried_delay)
             y = 0.0
             for j in range(m):
                 speed[j] = xx[m + j] + psi[j] * f
                 y += D[j] * speed[j]
             if stage == 0:
-                past[i % length] = y
+                past[i % past.size] = y
                 if i >= skip:
                     out[0, i - skip] = xx[:m]
                     out[1, i - skip] = speed
             late = y
             if delay > 0:
-                where = i + part - delay / H
-                at = int(np.floor(where))
-                if at < 2:
-                    late = 0.0
-                else:  # cubic between four samples; linear at the newest
-                    t = where - at
-                    p1, p2 = past[at % length], past[(at + 1) % length]
-                    late = p1 + t * (p2 - p1)
-                    if at + 2 <= i:
-                        p0, p3 = past[(at - 1) % length], past[(at + 2) % length]
-                        bend = 2 * p0 - 5 * p1 + 4 * p2 - p3 + t * (3 * (p1 - p2) + p3 - p0)
-                        late = p1 + 0.5 * t * (p2 - p0 + t * bend)
+                late = _earlier(past, i, part, delay * min(1 + late_bend * q * q, 3.0))
             s0, s1 = xx[2 * m + 1], xx[2 * m + 2]
             angle = omega * (i + part) * H
-            u = 0.0
+            u = hum * np.sin(TWO_PI * 50.0 * (i + part) * H)
             for h in range(3):
                 a = (h + 1) * angle
                 u += force[h].real * np.cos(a) - force[h].imag * np.sin(a)
@@ -213,6 +225,7 @@ def record(tube: Tube, frequency_hz: float, volts: float, rng: np.random.Generat
         count, skip, TWO_PI * f, zeta, psi, D, psi_a, tube.flame_rate, tube.flame_gain, tube.powers,
         tube.saturation, tube.quadratic_odd, tube.flame_filter, tube.delay_s, *tube.loss,
         force, omega, tube.modulation * slow, tube.rate_bend, *tube.memory, tube.stiffness,
+        tube.later_when_strong, *tube.carried, FORCE_PER_V * tube.hum_v,
     )  # fmt: skip
     k = WAVE_NUMBERS[: tube.modes]
     seen = VELOCITY_SCALE * speeds @ (D * np.array(tube.measured[: tube.modes]))
@@ -429,6 +442,9 @@ STRANGERS: dict[str, dict[str, Any]] = {
     "forward/stiffer when strong": {"stiffness": 1e-5 / 470**2},
     "actuator/motor follows displacement": {"drive": lambda v: v * (1 + 0.02 * np.roll(v, 1024))},
     "sensor/crosstalk of the drive": {"crosstalk": 0.5},
+    "flame nonlinearity/later when strong": {"delay_s": 0.4e-3, "later_when_strong": 0.1 / 4000**2},
+    "forward flame/carried to the end": {"carried": (0.03, 7e-3)},
+    "actuator sensor/hum at the speaker": {"hum_v": 0.05},
     "experiment/flame steps": {"drift": _course("flame_gain", 0.02, after=0.6)},
     "experiment/flame's rate to and fro": {"drift": _course("flame_rate", 0.04, period=0.7)},
     "actuator/backlash": {"drive": _with_play(0.01)},
