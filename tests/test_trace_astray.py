@@ -44,6 +44,7 @@ from tests.trace_material import (
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
 
+@pytest.mark.slow
 def test_a_side_resonator_beside_the_singing_mode_starts_from_that_mode_alone(
     tmp_path: Path,
 ) -> None:
@@ -624,6 +625,7 @@ def test_a_diagnosis_that_runs_out_of_time_says_so(tmp_path: Path) -> None:
     assert found.whereabouts is not None
 
 
+@pytest.mark.slow
 def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Path) -> None:
     """The declared fit leaves 70 times the noise, and two coalesced modes have taken up what the
     distortion makes: it leads nowhere. Of the placements of two further modes the right one comes

@@ -28,7 +28,11 @@ QUADRATIC = DeclaredModel(nonlinearity_degree=2)
 
 
 @pytest.mark.parametrize(
-    ("declared", "form"), [(LINEAR, "quadratic_cubic"), (QUADRATIC, "cubic")], ids=["linear", "2"]
+    ("declared", "form"),
+    [
+        pytest.param(LINEAR, "quadratic_cubic", id="linear"),
+        pytest.param(QUADRATIC, "cubic", id="2", marks=pytest.mark.slow),
+    ],
 )
 def test_the_powers_that_a_low_degree_lacks_are_found(
     tmp_path: Path, declared: DeclaredModel, form: str

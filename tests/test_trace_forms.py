@@ -163,8 +163,22 @@ COURSES = {
 }
 
 
-@pytest.mark.parametrize("course", COURSES)
-@pytest.mark.parametrize("what", ["frequency", "flame_gain", "damping", "speaker_gain"])
+USUAL = {  # the course that every run of the tests takes; the others are slow
+    "frequency": "step",
+    "flame_gain": "cycle",
+    "damping": "settling",
+    "speaker_gain": "step",
+}
+
+
+@pytest.mark.parametrize(
+    ("what", "course"),
+    [
+        pytest.param(what, course, marks=[] if course == usual else pytest.mark.slow)
+        for what, usual in USUAL.items()
+        for course in COURSES
+    ],
+)
 def test_what_changes_at_once_or_soon_or_to_and_fro(tmp_path: Path, what: str, course: str) -> None:
     """Without these forms a step of the flame's gain was claimed as its random modulation, and one
     of the speaker's as a drive that scatters."""
@@ -220,6 +234,7 @@ def test_held_out_runs_tell_on_which_side_of_a_step_they_lie() -> None:
     assert beside_one.resolution(now) == pytest.approx({"parameter_drift.step_time": 0.1 / 12**0.5})
 
 
+@pytest.mark.slow
 def test_an_amplifier_of_unequal_halves(tmp_path: Path) -> None:
     """u + a|u|: without it, a polynomial beside another mode."""
     a = 0.02
@@ -306,7 +321,7 @@ def test_a_sensitivity_that_drifts(tmp_path: Path) -> None:
     assert abs(e.value - change) < 4 * e.stderr < 0.1 * change
 
 
-@pytest.mark.parametrize("upper", [True, False])
+@pytest.mark.parametrize("upper", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_microphone_with_a_resonance(tmp_path: Path, upper: bool) -> None:
     """Without it, gain and skew of the channel beside two effects elsewhere."""
     hz, damping = 2000.0, 0.3
@@ -654,6 +669,7 @@ def test_what_wanders_is_sought_from_afar_where_a_fit_without_it_is_astray(tmp_p
     assert far[0].fit_p > 0.1  # the held-out runs are no softer
 
 
+@pytest.mark.slow
 def test_effects_are_sought_from_other_minima_of_the_declared_model_too(tmp_path: Path) -> None:
     """A gain of 1.3e-3 is made up for best by a mode that has gone to another's place, from where
     the gain leads nowhere; the next best minimum is the one that it was needed in (40024)."""
