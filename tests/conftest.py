@@ -22,6 +22,7 @@ for threads in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # read when NumPy i
     os.environ.setdefault(threads, "1")
 
 REQUIRE = "ENTRAIN_REQUIRE_COMPONENTS"
+SLOW_S = 900.0  # limit of a test marked slow
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -64,6 +65,12 @@ def _missing(item: pytest.Item) -> str | None:
             if not present():
                 return f"{name} not found: {remedy}"
     return None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:  # two minutes of a good machine are more than pytest's limit of another
+        if item.get_closest_marker("slow") is not None:
+            item.add_marker(pytest.mark.timeout(SLOW_S))
 
 
 @pytest.hookimpl(tryfirst=True)
