@@ -1228,4 +1228,7 @@ def test_a_law_beside_a_spread_leaves_what_noise_usually_does() -> None:
     assert alone.leaves_noise
     assert not beside.leaves_noise
     assert replace(beside, fit_p=0.2).leaves_noise
+    # nor what is held out: a law led to where chance is large enough for it (67029)
+    assert not replace(beside, fit_p=0.2, validation_p=0.005).leaves_noise
+    assert replace(beside, fit_p=0.2, validation_p=float("nan")).leaves_noise  # nothing held out
     assert replace(beside, effects=(by_key("flame_delay"),), spread=None).leaves_noise

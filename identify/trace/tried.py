@@ -30,6 +30,7 @@ OVERDAMPED = 0.15  # damping ratio of a mode that has strayed: beside a spread, 
 VISIBLE = 10.0  # … a misfit of so much χ²/dof
 LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
 LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws leaves less by chance
+HELD_OUT_P = 0.01  # the same of held-out runs, which no law beside it has been chosen by
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
 DECADES = 4.0  # over which the size of an effect may lie beforehand
 TINY = 1e-9  # of a number's scale: no smaller size is told apart
@@ -104,10 +105,14 @@ class Tried:
 
     @property
     def leaves_noise(self) -> bool:
-        """Whether what is left beside a spread, if there is one, is as probable as it must be."""
+        """Whether what is left beside a spread, if there is one, is as probable as it must be: a
+        law beside it may have been led to where chance is large enough for it (67029, a drift of a
+        quarter of a per cent, claimed as chance beside a loss in a poorer form)."""
         if self.spread is None or self.spread.unrivalled:
             return True
-        return self.fit_p > (LEFT_P if len(self.effects) == 1 else LEFT_BESIDE_P)
+        if len(self.effects) == 1:
+            return self.fit_p > LEFT_P
+        return self.fit_p > LEFT_BESIDE_P and not self.validation_p < HELD_OUT_P
 
     @property
     def has_values(self) -> bool:
