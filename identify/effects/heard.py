@@ -48,15 +48,14 @@ def _solved(r, size, power):  # type: ignore[no-untyped-def]
                 weight += inverse[t]
                 mean += rest[t] * inverse[t]
             mean /= weight
-            largest, powers = 0.0, 0.0
+            largest = 0.0
             for t in range(T):
                 step = (rest[t] - mean) * inverse[t]
                 p[t] = min(max(p[t] + step, -loudest), loudest)  # where no p fits, none runs away
                 largest = max(largest, abs(step))
-                powers += p[t] ** power * inverse[t]
             if largest < EXACT * loudest:
                 break
-        for t in range(T):
-            more[i, t] = p[t] - r[i, t]
-            by_size[i, t] = (powers / weight - p[t] ** power) * inverse[t]
+        mean = np.sum(p**power * inverse) / weight
+        more[i] = p - r[i]
+        by_size[i] = (mean - p**power) * inverse
     return more, by_size
