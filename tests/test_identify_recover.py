@@ -136,6 +136,7 @@ def test_a_flame_that_is_slower_when_it_is_louder_is_placed() -> None:
     assert found.left["flame"] < 0.1 * base.chi2_per_dof
 
 
+@pytest.mark.slow
 def test_a_tube_that_warms_is_traced() -> None:
     """Frequencies and dampings on one course: no drift of one thing explains them."""
     ready = prepare(campaign(3e-4, recorded=warmer, conditions=MORE))
@@ -231,7 +232,7 @@ def test_unusable_recordings_are_refused_by_name(change, words) -> None:
     [
         # the first fit ends with χ²/dof 232, the third mode at 687 instead of 539 Hz: as bad as if
         # the model were wrong
-        (129, 3, 3),
+        pytest.param(129, 3, 3, marks=pytest.mark.slow),
         # from small residues of one sign it ends with χ²/dof 146, the second mode at 573 instead of
         # 363 Hz; the way to the right place is a long valley
         (5095, 4, 2),

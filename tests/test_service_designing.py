@@ -153,6 +153,7 @@ def test_a_diagnosis_without_a_proposal_says_why(
         designing.resolved(plan, server.service.store)
 
 
+@pytest.mark.slow
 def test_rivals_that_no_run_tells_apart_in_the_minutes_of_the_design(
     server: Running, known: str
 ) -> None:

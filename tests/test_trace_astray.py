@@ -81,6 +81,7 @@ def test_a_damping_that_no_mode_has_sends_the_search_afar() -> None:
     assert not trace.astray(replace(usual, theta=theta, chi2=3.0 * usual.dof))
 
 
+@pytest.mark.slow
 def test_what_stands_in_another_s_place_beside_a_gross_effect(tmp_path: Path) -> None:
     """Of two gross effects neither leaves a place to start from: a sensor's lag that came up
     first beside a further mode gives way to the speaker's delay, from where it ended."""
@@ -481,6 +482,7 @@ def test_a_resonator_beside_the_singing_mode_at_its_own_frequency(tmp_path: Path
     assert not replace(best, fit=replace(best.fit, theta=giving)).plausible
 
 
+@pytest.mark.slow
 def test_a_strong_resonator_with_its_mouth_near_a_node_of_the_singing_mode(tmp_path: Path) -> None:
     """It feels mode 1 a sixtieth as much as mode 2, which it moves far."""
     size = {"frequency_hz": 408.2528, "damping": 0.025258, "coupling": 0.0206826}
@@ -498,6 +500,7 @@ def test_a_strong_resonator_with_its_mouth_near_a_node_of_the_singing_mode(tmp_p
     assert abs(frequency.value - size["frequency_hz"]) < 4 * frequency.stderr
 
 
+@pytest.mark.slow
 def test_a_resonator_felt_oppositely_by_the_second_mode(tmp_path: Path) -> None:
     """Its mouth lies where the two modes have opposite signs, between which no descent passes."""
     size = {"frequency_hz": 319.58, "damping": 0.031235, "coupling": 0.039238}
@@ -648,6 +651,7 @@ def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Pat
     assert known.value == pytest.approx(a2, abs=4 * known.stderr)
 
 
+@pytest.mark.slow
 def test_many_laws_follow_what_is_slight(tmp_path: Path) -> None:
     """A second time scale of the flame, which no candidate names, leaves 1.9 times the noise: a
     loss comes to the noise, and a free shape of the flame is far likelier (48030)."""

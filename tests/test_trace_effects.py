@@ -344,6 +344,7 @@ def test_what_stands_out_and_does_not_explain_keeps_none_from_a_start_afar(tmp_p
     assert tries[0].adequate
 
 
+@pytest.mark.slow
 def test_the_other_forms_of_the_nearest_effect_are_tried(tmp_path: Path) -> None:
     """A speaker that resonates at 160 Hz: by its acceleration, refitted first, it is not explained,
     and was with a further mode beside it."""
@@ -483,6 +484,7 @@ def test_a_mode_that_takes_little_part_is_found_by_its_tangents(tmp_path: Path) 
     assert there.cost < best.fit.chi2 + 3.0**2
 
 
+@pytest.mark.slow
 def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     """Strongly coupled, it shifts the tube's own modes and turns the phases of their residues; it
     is found from the further mode that comes nearest to it."""
@@ -1127,6 +1129,7 @@ def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:
     assert without_law(both, {("drive_scatter",)}, ready.data, InProcess()) == []
 
 
+@pytest.mark.slow
 def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
     """The drive's cubic term taken for a quadratic one leaves what no scatter of the drive is."""
     effects = {
@@ -1147,6 +1150,7 @@ def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
     assert abs(a3.value + 0.02) < 4 * a3.stderr
 
 
+@pytest.mark.slow
 def test_other_forms_are_asked_beside_each_kind_of_chance(tmp_path: Path) -> None:
     """The drive's scatter takes up whatever the drive does: beside it, the wrong form may leave
     less than beside the frequency's walk, which is the truth."""

@@ -250,7 +250,7 @@ def test_an_amplifier_of_unequal_halves(tmp_path: Path) -> None:
     assert abs(size.value - a) < 4 * size.stderr < a
 
 
-@pytest.mark.parametrize("milliseconds", [2.9, 13.0])
+@pytest.mark.parametrize("milliseconds", [2.9, pytest.param(13.0, marks=pytest.mark.slow)])
 def test_a_long_delay_of_the_drive(tmp_path: Path, milliseconds: float) -> None:
     """Half a cycle of the tube and more: a delay has a minimum every half cycle, and from one of
     3 % or 20 % of a cycle the fit came to the nearest. A mode and a peak of the speaker were
@@ -288,6 +288,7 @@ def test_a_long_delay_of_the_flame(tmp_path: Path) -> None:
     assert abs(delay.value - 5.5e-3) < 4 * delay.stderr < 1e-4
 
 
+@pytest.mark.slow
 def test_a_notch_of_the_speaker(tmp_path: Path) -> None:
     hz, damping, peak = 185.0, 0.15, -0.45
 
@@ -435,6 +436,7 @@ def test_a_drive_picked_up_in_a_channel(tmp_path: Path) -> None:
     assert abs(pickup.value - 0.4) < 4 * pickup.stderr < 0.1
 
 
+@pytest.mark.slow
 def test_a_voice_coil_that_warms(tmp_path: Path) -> None:
     """The speaker is given V/(1 + hV²) of the recorded V, and no harmonics."""
     h = 0.02
@@ -490,6 +492,7 @@ def test_two_further_modes_beside_another_effect(tmp_path: Path) -> None:
     assert abs(found.value - 0.01) < 4 * found.stderr
 
 
+@pytest.mark.slow
 def test_two_laws_of_loss_at_once(tmp_path: Path) -> None:
     """Their sum is sought from where one of them has come."""
     laws = [("quadratic", {"quadratic_per_m": 3.0}), ("cubic", {"cubic_s_per_m2": 20.0})]

@@ -72,6 +72,7 @@ def test_where_no_single_effect_comes_near_pairs_are_sought_at_once(tmp_path: Pa
     assert abs(delay.value - DELAY_S) < 4 * delay.stderr
 
 
+@pytest.mark.slow
 def test_pairs_that_the_tangents_promise(tmp_path: Path) -> None:
     """A loss and a microphone's lag: the one alone leaves far more than others do; the tangents
     where it has ended tell that the other makes up for it (42077, 54169)."""
@@ -274,6 +275,7 @@ def test_a_further_mode_must_be_somewhere() -> None:
     assert not a_further_mode("acoustic_mode.frequency_hz", 4.0).plausible
 
 
+@pytest.mark.slow
 def test_two_effects_of_one_place(tmp_path: Path) -> None:
     """A speaker that lags and bends: each leads the other astray, and a freely shaped speaker does
     not. From what that makes of the rest, both are found."""
@@ -330,6 +332,7 @@ def test_a_loss_is_seen_where_the_velocity_is_taken(tmp_path: Path) -> None:
     assert fit.chi2_per_dof < 2.0
 
 
+@pytest.mark.slow
 def test_of_two_that_explain_the_data_one_may_lack_another_form(tmp_path: Path) -> None:
     """A delay of the speaker that had been taken for a pole left hardly more than noise beside
     a drift, but what it left was taken for a third effect (58053)."""
