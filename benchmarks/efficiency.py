@@ -30,11 +30,12 @@ from trace_study import to_campaign
 
 from daq.service.reproduction.material import true_parameters
 from identify import assess, dataset, harmonics, start
-from identify.fit import Fit, OrbitResidual, covariance_of
+from identify.fit import Fit, covariance_of
 from identify.identification import prepare
 from identify.parameters import Estimate
 from identify.record import Campaign, Signal
 from identify.report.responses import closed_loop_poles
+from identify.residual import OrbitResidual
 from identify.structure import Structure
 from identify.thesis import EntrainedRuns, closed_loop
 from identify.whiteness import residual_tests

@@ -15,9 +15,11 @@ import numpy.typing as npt
 from identify import balance
 from identify.chances import chi2_tail
 from identify.dataset import Batch, Dataset
-from identify.fit import Fit, OrbitResidual, compare, levenberg_marquardt
+from identify.descent import levenberg_marquardt
+from identify.fit import Fit
 from identify.harmonics import VARIANCE_DOF
 from identify.lockin import LockIn, boundary
+from identify.residual import OrbitResidual, compare
 from identify.results import Assessment, Comparison, LimitCycle
 from identify.stability import Disturbed, leading_exponent, unstable_exponents
 from identify.structure import Structure

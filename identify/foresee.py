@@ -20,16 +20,11 @@ import numpy.typing as npt
 
 from identify import balance
 from identify.dataset import Batch, free_covariance, whitener
-from identify.fit import (
-    Evaluated,
-    Fit,
-    OrbitResidual,
-    Straightened,
-    compare,
-    levenberg_marquardt,
-)
+from identify.descent import Evaluated, levenberg_marquardt
+from identify.fit import Fit
 from identify.identification import Prepared
 from identify.reach import Option
+from identify.residual import OrbitResidual, Straightened, compare
 from identify.structure import Structure
 
 ComplexArray = npt.NDArray[np.complex128]

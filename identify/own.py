@@ -17,18 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Batch
+from identify.descent import Descent, Evaluated, Residual, levenberg_marquardt
 from identify.effects.scatter import Direction
-from identify.fit import (
-    Descent,
-    Evaluated,
-    OrbitResidual,
-    Pulled,
-    Residual,
-    Straightened,
-    levenberg_marquardt,
-    soften,
-)
 from identify.parameters import Parameter
+from identify.residual import OrbitResidual, Pulled, Straightened, soften
 from identify.structure import Conditions, Deviation, Effect, Mode, Structure, Values
 
 FloatArray = npt.NDArray[np.float64]

@@ -19,14 +19,9 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Dataset
-from identify.fit import (
-    Fit,
-    OrbitResidual,
-    Straightened,
-    covariance_of,
-    levenberg_marquardt,
-    resolutions,
-)
+from identify.descent import levenberg_marquardt
+from identify.fit import Fit, covariance_of, resolutions
+from identify.residual import OrbitResidual, Straightened
 
 FloatArray = npt.NDArray[np.float64]
 

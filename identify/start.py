@@ -25,17 +25,9 @@ import numpy.typing as npt
 
 from identify import assess, periods
 from identify.dataset import Batch, Dataset
-from identify.fit import (
-    Fit,
-    OrbitResidual,
-    Pulled,
-    Straightened,
-    failed,
-    fit_orbits,
-    levenberg_marquardt,
-    no_better,
-    soften,
-)
+from identify.descent import levenberg_marquardt
+from identify.fit import Fit, failed, fit_orbits, no_better
+from identify.residual import OrbitResidual, Pulled, Straightened, soften
 from identify.structure import Effect, Mode, Structure, Values, at_the_flame, driven
 from identify.thesis.rows import regressors
 

@@ -7,20 +7,12 @@ import numpy as np
 import pytest
 
 from identify import drive
-from identify.fit import (
-    Evaluated,
-    Fit,
-    FloatArray,
-    IntArray,
-    OrbitResidual,
-    covariance_of,
-    failed,
-    fit_orbits,
-    levenberg_marquardt,
-)
+from identify.descent import Evaluated, FloatArray, IntArray, levenberg_marquardt
+from identify.fit import Fit, covariance_of, failed, fit_orbits
 from identify.harmonics import VARIANCE_DOF
 from identify.identification import undetermined
 from identify.profile import intervals
+from identify.residual import OrbitResidual
 from identify.results import Comparison
 from identify.whiteness import residual_tests
 from tests.identify_coefficients import STRUCTURE, WIDE, clean, drawn, exact

@@ -543,6 +543,7 @@ def test_a_resonator_takes_energy_from_every_mode() -> None:
         assert all(f * r >= 0 for f, r in zip(load.felt, load.returned, strict=True))
 
 
+@pytest.mark.slow
 def test_a_lag_of_the_sound_is_one_of_the_record(tmp_path: Path) -> None:
     """A speaker's pole at 5 kHz: where the sensors' low-pass stands for it, the pole is tried from
     its values, which no start of its own had led to (effects 33032). No microphone is so slow."""

@@ -11,6 +11,7 @@ import pytest
 import identify
 from identify import assess, balance, diagnosis, start, trace
 from identify.chances import chi2_tail
+from identify.descent import levenberg_marquardt
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -26,10 +27,11 @@ from identify.effects.shaped import (
     lag,
 )
 from identify.executor import InProcess
-from identify.fit import Fit, OrbitResidual, fit_orbits, levenberg_marquardt
+from identify.fit import Fit, fit_orbits
 from identify.identification import Prepared
 from identify.parameters import Estimate
 from identify.report.gallery import save_figures
+from identify.residual import OrbitResidual
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
 from identify.structure import Conditions
@@ -195,7 +197,12 @@ def test_many_tests_count_as_many_as_they_are() -> None:
             {"hysteresis_width": 0.01},
             marks=pytest.mark.slow,
         ),
-        ("dead_zone", "nonlinearity_shape", {"dead_zone_width": 0.01}),
+        pytest.param(
+            "dead_zone",
+            "nonlinearity_shape",
+            {"dead_zone_width": 0.01},
+            marks=pytest.mark.slow,
+        ),
         ("quadratic_end", "nonlinear_damping", {"quadratic_per_m": 5.0}),
     ],
 )
@@ -603,7 +610,7 @@ def test_a_claim_takes_most_of_the_misfit_away(
     ("key", "parameters", "place"),
     [
         pytest.param("nonlinear_damping/cubic", {}, "forward", marks=pytest.mark.slow),
-        pytest.param("flame_delay", {"delay_s": 3e-4}, "flame", marks=pytest.mark.slow),
+        ("flame_delay", {"delay_s": 3e-4}, "flame"),
         ("nonlinearity_shape/quartic", {}, "nonlinearity"),
         ("nonlinear_damping/quadratic", {"quadratic_per_m": 20.0}, "forward"),
         pytest.param("actuator_dynamics/voice_coil", {}, "actuator", marks=pytest.mark.slow),
@@ -683,7 +690,12 @@ def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
         # a shift of the drive in time is one of the record, and their gains act nearly alike
         ("drive_scatter", {"gain_rms": 0.004, "phase_rms_rad": 0.004}, {"actuator", "sensor"}),
         ("flame_gain_modulation", {"modulation_rms": 0.02, "corner_hz": 2.0}, {"flame"}),
-        ("parameter_drift/frequency_walk", {"frequency_walk": 0.0005}, {"experiment"}),
+        pytest.param(
+            "parameter_drift/frequency_walk",
+            {"frequency_walk": 0.0005},
+            {"experiment"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_runs_that_deviate_are_placed(
@@ -766,6 +778,7 @@ def test_effects_of_two_places_that_leave_far_less_than_any_one(
     assert (found.likely, found.together) == (("sensor", "forward", "experiment"), None)
 
 
+@pytest.mark.slow
 def test_unexplained_says_where(tmp_path: Path) -> None:
     """Without the candidate that it is, a flame delay ends as unexplained, on the flame's side."""
     ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})

@@ -19,10 +19,10 @@ from identify.effects import CATALOGUE, by_key
 from identify.effects.experiment import Step
 from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
-from identify.fit import OrbitResidual, soften
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.polynomial import Polynomial
+from identify.residual import OrbitResidual, soften
 from identify.scatter import Spread, fit_scatter
 from identify.structure import driven
 from identify.trace import contests, selection, stages
@@ -307,6 +307,7 @@ def test_a_notch_of_the_speaker(tmp_path: Path) -> None:
         assert abs(e.value - value) < 4 * e.stderr < 0.2 * abs(value)
 
 
+@pytest.mark.slow
 def test_a_sensitivity_that_drifts(tmp_path: Path) -> None:
     """Of one microphone of two."""
     change, last = 0.01, max(run.started_s for run in planned()[1])
@@ -322,7 +323,8 @@ def test_a_sensitivity_that_drifts(tmp_path: Path) -> None:
     assert abs(e.value - change) < 4 * e.stderr < 0.1 * change
 
 
-@pytest.mark.parametrize("upper", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("upper", [True, False])
 def test_a_microphone_with_a_resonance(tmp_path: Path, upper: bool) -> None:
     """Without it, gain and skew of the channel beside two effects elsewhere."""
     hz, damping = 2000.0, 0.3

@@ -17,7 +17,8 @@ from identify.chances import chi2_points, chi2_tail
 from identify.dataset import Dataset
 from identify.effects.scatter import Scatter
 from identify.executor import Executor
-from identify.fit import Fit, OrbitResidual
+from identify.fit import Fit
+from identify.residual import OrbitResidual
 from identify.structure import Effect, Structure
 from identify.trace.tried import first_of_each
 

@@ -12,7 +12,8 @@ from identify.dataset import Dataset
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, InProcess, Progress
-from identify.fit import Fit, fit_orbits, soften
+from identify.fit import Fit, fit_orbits
+from identify.residual import soften
 from identify.start import fit_from_data, other_minima
 from identify.structure import Effect, Structure
 from identify.trace.beside_chance import (
