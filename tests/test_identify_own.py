@@ -163,6 +163,7 @@ def test_a_spread_guessed_too_wide_leads_nothing_astray(tmp_path: Path) -> None:
     assert abs(np.log(known.value / 1.4169e-4)) < 3 * known.stderr / known.value
 
 
+@pytest.mark.slow
 def test_that_one_run_of_few_deviates_may_be_luck(tmp_path: Path) -> None:
     """Of eight runs one has nine tenths of all phase (53039): seldom, and no more."""
     size = 0.00955810219346193
@@ -180,7 +181,7 @@ def test_that_one_run_of_few_deviates_may_be_luck(tmp_path: Path) -> None:
     ("name", "size"),
     [
         ("drive_scatter", {"gain_rms": 0.01, "phase_rms_rad": 0.01}),
-        ("parameter_drift", {"frequency_walk": WALK}),
+        pytest.param("parameter_drift", {"frequency_walk": WALK}, marks=pytest.mark.slow),
     ],
 )
 def test_the_widened_data_are_where_the_fit_ended(

@@ -123,6 +123,7 @@ def test_clean_data_show_no_discrepancy() -> None:
     assert diagnosis.effects == ()
 
 
+@pytest.mark.slow
 def test_a_flame_that_is_slower_when_it_is_louder_is_placed() -> None:
     """Its describing function is no filter and no characteristic, and lies in the flame alone."""
     ready = prepare(campaign(3e-4, recorded=slower, conditions=MORE))

@@ -573,6 +573,7 @@ def test_a_lag_that_microphones_may_have_is_a_rival(tmp_path: Path) -> None:
     assert trace.but_for_values(delay, [lowpass]) == []
 
 
+@pytest.mark.slow
 def test_what_would_do_but_for_its_values_is_named(tmp_path: Path) -> None:
     """A speaker 20 µs late is claimed, and what the claim rests on is said."""
     ready, _ = recorded(tmp_path, 3, "actuator_dynamics/delay", noise_db=40.0, delay_s=2e-5)

@@ -27,11 +27,12 @@ LINEAR = DeclaredModel(nonlinearity="linear")
 QUADRATIC = DeclaredModel(nonlinearity_degree=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("declared", "form"),
     [
         pytest.param(LINEAR, "quadratic_cubic", id="linear"),
-        pytest.param(QUADRATIC, "cubic", id="2", marks=pytest.mark.slow),
+        pytest.param(QUADRATIC, "cubic", id="2"),
     ],
 )
 def test_the_powers_that_a_low_degree_lacks_are_found(

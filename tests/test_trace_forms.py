@@ -279,6 +279,7 @@ def test_a_channel_that_began_late(tmp_path: Path) -> None:
     assert abs(skew.value - 2e-3) < 4 * skew.stderr < 1e-5
 
 
+@pytest.mark.slow
 def test_a_long_delay_of_the_flame(tmp_path: Path) -> None:
     """The gas takes most of a cycle from where it is moved to where it burns."""
     ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 5.5e-3}})
@@ -346,7 +347,12 @@ def test_a_microphone_with_a_resonance(tmp_path: Path, upper: bool) -> None:
 
 
 @pytest.mark.parametrize(
-    ("which", "power", "share"), [("both", 3, -0.01), ("both", 2, 0.02), ("upper", 2, 0.005)]
+    ("which", "power", "share"),
+    [
+        pytest.param("both", 3, -0.01, marks=pytest.mark.slow),
+        ("both", 2, 0.02),
+        ("upper", 2, 0.005),
+    ],
 )
 def test_microphones_that_bend(tmp_path: Path, which: str, power: int, share: float) -> None:
     """By that share of the largest pressure there is."""
@@ -424,6 +430,7 @@ def test_a_spread_does_not_hide_a_mode_that_has_strayed(tmp_path: Path) -> None:
     assert replace(astray, effects=(), spread=None).plausible  # a law need not be at its end there
 
 
+@pytest.mark.slow
 def test_a_drive_picked_up_in_a_channel(tmp_path: Path) -> None:
     """Without this candidate, one more mode and another place of the sensor were claimed."""
 

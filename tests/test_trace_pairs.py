@@ -182,7 +182,9 @@ def test_signed_starts_have_both_signs_in_each_other_mode(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("form", "truth", "values"),
     [
-        ("gain", {"gain": 0.02}, {"channel_mismatch.gain": 0.02}),
+        pytest.param(
+            "gain", {"gain": 0.02}, {"channel_mismatch.gain": 0.02}, marks=pytest.mark.slow
+        ),
         ("skew", {"skew_s": -2e-5}, {"channel_mismatch.skew_s": -2e-5}),
     ],
 )

@@ -14,7 +14,8 @@ pytestmark = pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("seed", "turbulence_v", "coloured", "forced"),
     [
-        (50122, 0.0333, False, 9),  # a damped mode's noise, as hum at 6 × 50 Hz
+        # a damped mode's noise, as hum at 6 × 50 Hz
+        pytest.param(50122, 0.0333, False, 9, marks=pytest.mark.slow),
         (50052, 0.0205, True, 11),  # noise that the pressure has too, as a sensor elsewhere
         (50026, 0.0114, False, 9),
     ],
