@@ -53,8 +53,8 @@ def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
 
 
 class Drift(Effect):
-    """A relative change over the campaign, linear in time; ``_curve``: and quadratic;
-    ``_settling``: towards a last value, as what warms up does; at once, `Step`.
+    """A relative change over the campaign: linear in time, with a quadratic part (``_curve``), or
+    towards a last value, as what warms up does (``_settling``).
 
     ``frequency``: all modal frequencies together, as temperature does; ``flame_gain``: the fuel;
     ``damping``; ``speaker_gain``: a warming voice coil; ``first_mode`` and ``first_damping``: mode
@@ -174,7 +174,10 @@ def _next_to(times: FloatArray, when: float) -> tuple[float, float]:
 
 class Cycle(Effect):
     """A relative change to and fro, as where a thermostat or a compressor goes on and off:
-    1 + a sin ωt + b (1 − cos ωt), of what as in `Drift`."""
+    1 + a sin ωt + b (1 − cos ωt).
+
+    Of what, as in `Drift`.
+    """
 
     name, location = "parameter_drift", "experiment"
 

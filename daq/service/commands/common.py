@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
 if TYPE_CHECKING:
     from daq.store import RunStore
@@ -82,6 +84,12 @@ def table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) 
     for row in rows:
         shown.add_row(*(escape("" if cell is None else str(cell)) for cell in row))
     out.print(shown)
+
+
+def indented(text: str, spaces: int, style: str = "") -> None:
+    """Print a paragraph so far to the right, wrapped at words; nothing for no text."""
+    if text:
+        out.print(Padding(Text(text, style), (0, 0, 0, spaces)))
 
 
 def number(value: float | None, digits: int = 4) -> str:

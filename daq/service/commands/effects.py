@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from daq.errors import InputError
-from daq.service.commands.common import JsonOption, table, write_json
+from daq.service.commands.common import JsonOption, indented, write_json
 
 if TYPE_CHECKING:
     from identify.structure import Effect
@@ -26,12 +26,13 @@ def effects(
     found = [_facts(e) for e in CANDIDATES if name in (None, e.name)]
     write_json(json_, {"effects": found})
     if str(json_) != "-":
-        alike = groupby(found, key=lambda f: (f["effect"], f["location"], f["about"]))
-        table(
-            "",
-            ("effect", "location", "forms", "parameters, plausible range", "what it is"),
-            ((*head[:2], *_joined(list(forms)), head[2]) for head, forms in alike),
-        )
+        for (effect, location), forms in groupby(found, lambda f: (f["effect"], f["location"])):
+            indented(f"{effect}  ({location})", 0, "bold")
+            for about, alike in groupby(forms, lambda f: f["about"]):
+                named, parameters = _joined(list(alike))
+                indented(named, 2)
+                indented(about, 6)
+                indented(parameters, 6, "dim")
 
 
 def _facts(effect: "Effect") -> dict[str, Any]:
@@ -49,9 +50,10 @@ def _facts(effect: "Effect") -> dict[str, Any]:
 
 
 def _joined(forms: list[dict[str, Any]]) -> tuple[str, str]:
-    """The forms that one class has, and the parameters that any of them has."""
+    """The forms that one class has, and the parameters that any of them has, with the ranges in
+    which they are plausible."""
     parameters = dict.fromkeys(_shown(q) for f in forms for q in f["parameters"])
-    return "\n".join(dict.fromkeys(f["form"] for f in forms)), "\n".join(parameters)
+    return ", ".join(dict.fromkeys(f["form"] for f in forms)), "; ".join(parameters)
 
 
 def _shown(parameter: dict[str, Any]) -> str:
