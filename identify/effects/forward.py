@@ -187,9 +187,10 @@ class SideResonatorOfMode(_Resonator):
 class SideResonator(_Resonator):
     """A Helmholtz resonator or a plenum beside the tube, coupled to each mode by its own strength.
 
-    Of `modes` modes, relative to the first, g_1 = 1. Of a mode that has a node at the mouth it feels nothing and gives nothing back, h_i = 0; and it
-    takes energy from every mode, never gives, g_i > 0. Other than one more mode, it moves the
-    poles of the others, and its residues have phases.
+    Of `modes` modes, relative to the first, g_1 = 1. Of a mode that has a node at the mouth it
+    feels nothing and gives nothing back, h_i = 0; and it takes energy from every mode, never gives,
+    g_i > 0. Other than one more mode, it moves the poles of the others, and its residues have
+    phases.
     """
 
     form, refines = "side_resonator", True
