@@ -563,6 +563,13 @@ def every_start(structure: Structure, data: Dataset) -> list[CoarseStart]:
     return sorted([*exact, *physical_starts(structure, data)], key=lambda c: c.cost)
 
 
+def fit_from_balance(structure: Structure, data: Dataset) -> tuple[Fit | None, list[CoarseStart]]:
+    """The fit from the best start of the polynomial balance, exact where the model is, if there is
+    any; and all of these starts, best first."""
+    starts = coarse(structure, data, candidates(structure, data))
+    return (fit_orbits(structure, data, starts[0].theta) if starts else None), starts
+
+
 def fit_from_data(structure: Structure, data: Dataset) -> Fit:
     """The maximum-likelihood fit from data alone, over several starts; the best one wins.
 
@@ -572,11 +579,9 @@ def fit_from_data(structure: Structure, data: Dataset) -> Fit:
     Where that ends near the noise but not at it, or the runs are few, or a mode has strayed, the
     other modes are placed more densely.
     """
-    starts = coarse(structure, data, candidates(structure, data))
-    for start in starts[:1]:  # the polynomial balance is exact where the model is: try it first
-        fit = fit_orbits(structure, data, start.theta)
-        if _adequate(fit):
-            return fit
+    exact, starts = fit_from_balance(structure, data)
+    if exact is not None and _adequate(exact):
+        return exact
     rough = data.coarse()
     starts = sorted([*starts[:6], *physical_starts(structure, rough)], key=lambda c: c.cost)
     polished = polish(structure, rough, starts[:12])

@@ -94,11 +94,11 @@ def test_what_a_diagnosis_can_find_is_listed(home: Path, capfd: pytest.CaptureFi
     assert (code, listed) == (0, [(e.name, e.form) for e in CANDIDATES])
     code, out, _ = entrain(capfd, "effects", "flame_delay")
     assert code == 0
-    assert "delay_s: 0 to 0.02" in out
+    assert "delay_s: 1e-06 to 0.02 s" in out
     code, out, _ = entrain(capfd, "effects", "flame_delay", "--json", "-")
     (delay,) = json.loads(out)["effects"]
     assert (code, delay["location"]) == (0, "flame")
-    assert delay["parameters"] == [{"name": "delay_s", "unit": "s", "range": [0.0, 0.02]}]
+    assert delay["parameters"] == [{"name": "delay_s", "unit": "s", "range": [1e-6, 0.02]}]
     code, out, err = entrain(capfd, "effects", "flame_delays")
     assert (code, out) == (2, "")
     assert "name='flame_delays' is no effect: one of acoustic_mode" in " ".join(err.split())

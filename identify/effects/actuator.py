@@ -13,6 +13,10 @@ from identify.structure import Bent, Conditions, Effect, Known, Values
 
 FloatArray = npt.NDArray[np.float64]
 
+#: Least lag of an amplifier and a speaker that is plausible, s: 3 dB down at 160 kHz. Where little
+#: noise shows less than that, such a phase may come from anything.
+FASTEST_S = 1e-6
+SLOWEST_HZ = 0.1  # least corner of an amplifier's coupling: a time constant of 1.6 s
 UNEQUAL = (0.87, 0.95, 1.05, 1.15)  # of one level, where the two of a pair are sought
 
 
@@ -49,7 +53,7 @@ class VoiceCoil(Effect):
     """First-order lag of the voice coil, 1/(1 + sT)."""
 
     name, location, form = "actuator_dynamics", "actuator", "pole"
-    parameters = (Parameter("actuator_dynamics.time_s", "s", 0.0, 0.1, scale=1e-4),)
+    parameters = (Parameter("actuator_dynamics.time_s", "s", FASTEST_S, 0.1, scale=1e-4),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.03 / known.free_hz,), (0.3 / known.free_hz,)]
@@ -65,7 +69,7 @@ class Coupling(Effect):
     """An amplifier that passes no direct voltage: a first-order high-pass, s/(s + ω)."""
 
     name, location, form = "actuator_dynamics", "actuator", "highpass"
-    parameters = (Parameter("actuator_dynamics.corner_hz", "Hz", 0.0, 1e3, scale=10.0),)
+    parameters = (Parameter("actuator_dynamics.corner_hz", "Hz", SLOWEST_HZ, 1e3, scale=10.0),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.03 * known.free_hz,), (0.3 * known.free_hz,)]

@@ -271,6 +271,9 @@ class ModalOffset(Effect):
 #: Slowest first-order lag of a pressure channel that is plausible, s: 2 dB down at 12 kHz, 3 dB at
 #: 16 kHz. Measuring microphones and dynamic pressure sensors reach further by their data sheets.
 SLOWEST_MICROPHONE_S = 1e-5
+#: Least corner of a pressure channel's coupling that is plausible, Hz: a charge amplifier's of a
+#: piezoelectric sensor, with a time constant of 16 s.
+LOWEST_HZ = 0.01
 
 
 class SensorLag(Effect):
@@ -304,7 +307,7 @@ class SensorCoupling(Effect):
     """Both microphones pass no direct voltage: a first-order high-pass, s/(s + ω)."""
 
     name, location, form = "sensor_dynamics", "sensor", "highpass"
-    parameters = (Parameter("sensor_dynamics.corner_hz", "Hz", 0.0, 1e3, scale=10.0),)
+    parameters = (Parameter("sensor_dynamics.corner_hz", "Hz", LOWEST_HZ, 1e3, scale=10.0),)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.03 * known.free_hz,)]

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from identify.dataset import Batch, Dataset
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
-from identify.start import fit_declared
+from identify.start import NEARLY, fit_declared, fit_from_balance
 from identify.structure import Structure
 from identify.trace.tried import tried
 
@@ -64,7 +64,12 @@ def lone_run(
 
 def _fitted(item: tuple[Structure, Dataset, Sequence[FloatArray], bool]) -> Fit:
     structure, rest, thetas, anew = item
-    fits = [fit_orbits(structure, rest, np.stack(thetas), continuation=(0.003, 0.0))]
-    if anew and not (fits[0].chi2 < 2 * fits[0].dof):
+    fit = fit_orbits(structure, rest, np.stack(thetas), continuation=(0.003, 0.0))
+    if not anew or fit.chi2 < 2 * fit.dof:
+        return fit
+    exact, _ = fit_from_balance(structure, rest)
+    fits = [fit] if exact is None else [fit, exact]
+    # with a mode at the wrong place, one of these would leave no more than that
+    if any(f.chi2_per_dof < NEARLY for f in fits):
         fits.append(fit_declared(structure, rest))
     return min(fits, key=lambda f: f.chi2)
