@@ -28,6 +28,7 @@ class SpeakerResonance(Effect):
         Parameter("actuator_dynamics.frequency_hz", "Hz", 5.0, 5e3, "positive"),
         Parameter("actuator_dynamics.damping", "1", 0.005, 5.0, "positive"),
     )
+    located = ("actuator_dynamics.frequency_hz",)
 
     def __init__(self, form: str) -> None:
         self.form = form
@@ -87,6 +88,7 @@ class LaggingResonance(Effect):
     name, location, form = "actuator_dynamics", "actuator", "resonance_pole"
     resonance, lag = SpeakerResonance("resonance"), VoiceCoil()
     parameters = (*resonance.parameters, *lag.parameters)
+    located = resonance.located
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         return [(*row, *self.lag.starts(known)[0]) for row in self.resonance.starts(known)]
@@ -110,6 +112,7 @@ class SpeakerPeak(Effect):
         Parameter("actuator_dynamics.peak", "1", -1.0, 50.0, scale=1e-2),
         *SpeakerResonance.parameters,
     )
+    located = SpeakerResonance.located
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         sizes = (0.5, -0.5)

@@ -134,6 +134,7 @@ class MicrophoneResonance(Effect):
         Parameter("channel_mismatch.frequency_hz", "Hz", 50.0, 1e5, "positive"),
         Parameter("channel_mismatch.damping", "1", 0.005, 5.0, "positive"),
     )
+    located = ("channel_mismatch.frequency_hz",)
 
     def __init__(self, upper: bool) -> None:
         self.upper, self.form = upper, "upper_resonance" if upper else "lower_resonance"
