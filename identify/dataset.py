@@ -144,6 +144,11 @@ class Dataset:
         """For searching from afar: three harmonics compared, six solved for."""
         return replace(self, fit=tuple(b.limited(3, 6) for b in self.fit))
 
+    def screening(self) -> "Dataset":
+        """For choosing among very many starts, at noise that hides what the harmonics above change
+        in the first three: these compared, four solved for."""
+        return replace(self, fit=tuple(b.limited(3, 4) for b in self.fit))
+
     def noise_floor(self, which: Sequence[Batch]) -> float:
         """The validation error that noise alone would cause."""
         noise = sum(float(b.noise.sum()) for b in which)

@@ -385,7 +385,7 @@ def signed_starts(
     thetas = []
     for row in effect_values:
         thetas += _signed(structure, _slow_flow_thetas(structure, data, row, placements))
-    return _best_of_each(structure, coarse(structure, data, thetas))
+    return _best_of_each(structure, coarse(structure, data.screening(), thetas))
 
 
 def _signed(structure: Structure, thetas: Sequence[FloatArray]) -> list[FloatArray]:
@@ -407,9 +407,12 @@ def _best_of_each(structure: Structure, starts: Sequence[CoarseStart]) -> list[C
     residues = [index[f"mode{i}.flame_residue"] for i in others]
     own = [index[q.name] for e in structure.effects for q in e.parameters]
     where = [*(index[f"mode{i}.frequency_hz"] for i in others), *own]
+    if not starts:
+        return []
+    thetas = np.stack([found.theta for found in starts])
+    kinds = np.c_[np.round(thetas[:, where], 6), np.sign(thetas[:, residues])]
     best: dict[bytes, CoarseStart] = {}
-    for found in starts:
-        kind = np.r_[np.round(found.theta[where], 6), np.sign(found.theta[residues])]
+    for kind, found in zip(kinds, starts, strict=True):
         best.setdefault(kind.tobytes(), found)
     return list(best.values())
 
@@ -423,7 +426,17 @@ def _slow_flow_thetas(
     names = [q.name for e in structure.effects for q in e.parameters]
     p = dict(zip(names, effect_values, strict=True))
     flow = slow_flow(data, structure.effects, {**p, "flame.pole_hz": data.free_hz})
-    w0 = flow.omega
+    w0, everywhere = flow.omega, placements or _placements(structure.mode_count - 1)
+    later = [f"mode{i}.frequency_hz" for i in range(2, structure.mode_count + 1)]
+    index = structure.parameters.index
+    others = [index[name] for name in later]
+    placed = [
+        [
+            structure.parameters.parameters[i].to_internal(ratio * w0 / (2 * np.pi))
+            for i, ratio in zip(others, ratios, strict=True)
+        ]
+        for ratios in everywhere
+    ]
     thetas = []
     for pole in (flow.pole, 0.6 * w0) if structure.flame_order else (0.0,):
         gain = 1j * w0 / (1j * w0 + pole) * flow.flame_phase
@@ -433,23 +446,26 @@ def _slow_flow_thetas(
             w1 = w0 - 0.5 * ((flow.a * flow.z0).imag + r * gain.imag)
             h2 = 1.0 / abs(1j * w0 + pole) ** 2
             c3 = -float(np.abs(flow.a * flow.z2) / (0.75 * abs(r * gain) * h2 + 1e-300))
-            for others in placements or _placements(structure.mode_count - 1):
-                values: dict[str, float] = {
-                    **p,
-                    "mode1.frequency_hz": float(np.clip(w1, 0.9 * w0, 1.1 * w0)) / (2 * np.pi),
-                    "mode1.damping": zeta,
-                    "mode1.flame_residue": float(r),
-                    "mode1.speaker_residue": flow.a,
-                }
-                for i, ratio in enumerate(others, start=2):
-                    values[f"mode{i}.frequency_hz"] = ratio * w0 / (2 * np.pi)
-                    values[f"mode{i}.damping"] = 0.03
-                    values[f"mode{i}.flame_residue"] = 0.05 * float(r)
-                    values[f"mode{i}.speaker_residue"] = 0.05 * flow.a
-                for j in range(1, structure.flame_order + 1):
-                    key = "flame.pole_hz" if j == 1 else f"flame.pole{j}_hz"
-                    values[key] = pole * (1.0 if j == 1 else 5.0 * j) / (2 * np.pi)
-                thetas.append(_named(structure, values, [0.0, c3]))
+            values: dict[str, float] = {
+                **p,
+                "mode1.frequency_hz": float(np.clip(w1, 0.9 * w0, 1.1 * w0)) / (2 * np.pi),
+                "mode1.damping": zeta,
+                "mode1.flame_residue": float(r),
+                "mode1.speaker_residue": flow.a,
+            }
+            for i in range(2, structure.mode_count + 1):
+                values[f"mode{i}.frequency_hz"] = w0 / (2 * np.pi)
+                values[f"mode{i}.damping"] = 0.03
+                values[f"mode{i}.flame_residue"] = 0.05 * float(r)
+                values[f"mode{i}.speaker_residue"] = 0.05 * flow.a
+            for j in range(1, structure.flame_order + 1):
+                key = "flame.pole_hz" if j == 1 else f"flame.pole{j}_hz"
+                values[key] = pole * (1.0 if j == 1 else 5.0 * j) / (2 * np.pi)
+            theta = _named(structure, values, [0.0, c3])
+            for frequencies in placed:
+                moved = theta.copy()
+                moved[others] = frequencies
+                thetas.append(moved)
     return thetas
 
 
