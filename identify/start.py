@@ -539,6 +539,8 @@ def _placements(count: int) -> list[tuple[float, ...]]:
 def dense_placements(count: int) -> list[tuple[float, ...]]:
     """The same a tenth apart, every pair of two, further ones regularly above."""
     grid = [1.35 * 1.11**j for j in range(10)]
+    if count == 0:
+        return [()]
     if count == 1:
         return [(q,) for q in grid]
     return [
