@@ -140,14 +140,9 @@ class Dataset:
         """Seconds from the campaign's start to that of its last run."""
         return max(float(b.started_s.max()) for b in (*self.fit, *self.validation))
 
-    def coarse(self) -> "Dataset":
-        """For searching from afar: three harmonics compared, six solved for."""
-        return replace(self, fit=tuple(b.limited(3, 6) for b in self.fit))
-
-    def screening(self) -> "Dataset":
-        """For choosing among very many starts, at noise that hides what the harmonics above change
-        in the first three: these compared, four solved for."""
-        return replace(self, fit=tuple(b.limited(3, 4) for b in self.fit))
+    def coarse(self, solved: int = 6) -> "Dataset":
+        """For searching from afar: three harmonics compared, so many `solved` for."""
+        return replace(self, fit=tuple(b.limited(3, solved) for b in self.fit))
 
     def noise_floor(self, which: Sequence[Batch]) -> float:
         """The validation error that noise alone would cause."""

@@ -44,6 +44,7 @@ LONG = 600  # iterations that lead on what comes nearest and has not converged
 DAMPED = (3e-4, 0.5)  # damping ratios between which a mode is one
 REFUSED = 1e-3  # chance of held-out runs below which another minimum is sought that suits them too
 SAME_DEPTH = 1e-3  # share of χ² by which two minima differ
+SCREENED = 4  # harmonics solved for to choose among thousands: noise of a tenth hides the others
 FEW = 4.0  # degrees of freedom an unknown: with fewer, a misplaced mode may look worse than that
 
 
@@ -385,16 +386,21 @@ def signed_starts(
     thetas = []
     for row in effect_values:
         thetas += _signed(structure, _slow_flow_thetas(structure, data, row, placements))
-    return _best_of_each(structure, coarse(structure, data.screening(), thetas))
+    return _best_of_each(structure, coarse(structure, data.coarse(SCREENED), thetas))
+
+
+def _of_others(structure: Structure, kind: str) -> list[int]:
+    """Which unknowns are of this kind in the modes that do not sing."""
+    index = structure.parameters.index
+    return [index[f"mode{i}.{kind}"] for i in range(2, structure.mode_count + 1)]
 
 
 def _signed(structure: Structure, thetas: Sequence[FloatArray]) -> list[FloatArray]:
     """Each with four times the flame residues of the modes that do not sing, of either sign."""
-    index, n = structure.parameters.index, structure.mode_count
-    residues = [index[f"mode{i}.flame_residue"] for i in range(2, n + 1)]
+    residues = _of_others(structure, "flame_residue")
     out = []
     for theta in thetas:
-        for signs in product((1.0, -1.0), repeat=n - 1):
+        for signs in product((1.0, -1.0), repeat=len(residues)):
             signed = theta.copy()
             signed[residues] *= 4 * np.array(signs)
             out.append(signed)
@@ -403,12 +409,11 @@ def _signed(structure: Structure, thetas: Sequence[FloatArray]) -> list[FloatArr
 
 def _best_of_each(structure: Structure, starts: Sequence[CoarseStart]) -> list[CoarseStart]:
     """Of sorted starts the first for each row of effect values, placement and signs."""
-    index, others = structure.parameters.index, range(2, structure.mode_count + 1)
-    residues = [index[f"mode{i}.flame_residue"] for i in others]
-    own = [index[q.name] for e in structure.effects for q in e.parameters]
-    where = [*(index[f"mode{i}.frequency_hz"] for i in others), *own]
     if not starts:
         return []
+    index, residues = structure.parameters.index, _of_others(structure, "flame_residue")
+    own = [index[q.name] for e in structure.effects for q in e.parameters]
+    where = [*_of_others(structure, "frequency_hz"), *own]
     thetas = np.stack([found.theta for found in starts])
     kinds = np.c_[np.round(thetas[:, where], 6), np.sign(thetas[:, residues])]
     best: dict[bytes, CoarseStart] = {}
@@ -426,16 +431,11 @@ def _slow_flow_thetas(
     names = [q.name for e in structure.effects for q in e.parameters]
     p = dict(zip(names, effect_values, strict=True))
     flow = slow_flow(data, structure.effects, {**p, "flame.pole_hz": data.free_hz})
-    w0, everywhere = flow.omega, placements or _placements(structure.mode_count - 1)
-    later = [f"mode{i}.frequency_hz" for i in range(2, structure.mode_count + 1)]
-    index = structure.parameters.index
-    others = [index[name] for name in later]
+    w0, others = flow.omega, _of_others(structure, "frequency_hz")
+    unknowns = [structure.parameters.parameters[i] for i in others]
     placed = [
-        [
-            structure.parameters.parameters[i].to_internal(ratio * w0 / (2 * np.pi))
-            for i, ratio in zip(others, ratios, strict=True)
-        ]
-        for ratios in everywhere
+        [q.to_internal(x * w0 / (2 * np.pi)) for q, x in zip(unknowns, ratios, strict=True)]
+        for ratios in placements or _placements(len(others))
     ]
     thetas = []
     for pole in (flow.pole, 0.6 * w0) if structure.flame_order else (0.0,):
@@ -526,28 +526,26 @@ def _placements(count: int) -> list[tuple[float, ...]]:
     """Assumed frequencies of the other modes over the singing one's: from a closed-open tube's
     odd ratios, an open or closed tube's whole ones, and in between."""
     single = (1.35, 1.67, 2.0, 2.4, 3.0)
-    if count == 0:
-        return [()]
-    if count == 1:
-        return [(q,) for q in single]
-    ladders = [(1.67, 2.33), (2.0, 3.0), (1.4, 2.4), (1.67, 3.0), (2.4, 3.2)]
-    return [
-        tuple(pair) + tuple(pair[-1] + 0.8 * j for j in range(1, count - 1)) for pair in ladders
-    ]
+    pairs = [(1.67, 2.33), (2.0, 3.0), (1.4, 2.4), (1.67, 3.0), (2.4, 3.2)]
+    return _laddered(count, single, pairs)
 
 
 def dense_placements(count: int) -> list[tuple[float, ...]]:
     """The same a tenth apart, every pair of two, further ones regularly above."""
     grid = [1.35 * 1.11**j for j in range(10)]
+    pairs = [(low, high) for i, low in enumerate(grid) for high in grid[i + 2 :]]
+    return _laddered(count, grid, pairs)
+
+
+def _laddered(
+    count: int, single: Sequence[float], pairs: Sequence[tuple[float, float]]
+) -> list[tuple[float, ...]]:
+    """Places of so many modes: one of `single`, or of `pairs`, and further ones regularly above."""
     if count == 0:
         return [()]
     if count == 1:
-        return [(q,) for q in grid]
-    return [
-        (low, high, *(high + 0.8 * j for j in range(1, count - 1)))
-        for i, low in enumerate(grid)
-        for high in grid[i + 2 :]
-    ]
+        return [(q,) for q in single]
+    return [(low, high, *(high + 0.8 * j for j in range(1, count - 1))) for low, high in pairs]
 
 
 def _weak_pulls(structure: Structure) -> FloatArray:
@@ -565,26 +563,31 @@ def _weak_pulls(structure: Structure) -> FloatArray:
     return np.asarray(np.diag(weights)[weights > 0])
 
 
+def balanced_starts(structure: Structure, data: Dataset) -> list[CoarseStart]:
+    """Those of the polynomial balance, best first."""
+    return coarse(structure, data, candidates(structure, data))
+
+
 def distant_starts(
     structure: Structure, data: Dataset, effect_values: Sequence[float]
 ) -> list[CoarseStart]:
     """The polynomial balance's best starts, and those of the slow flow with the other modes placed
     densely and of either sign: for data that lead the declared fit astray."""
-    exact = [] if structure.effects else coarse(structure, data, candidates(structure, data))[:6]
+    exact = [] if structure.effects else balanced_starts(structure, data)[:6]
     dense = dense_placements(structure.mode_count - 1)
     return [*exact, *signed_starts(structure, data, [effect_values], dense)[:DISTANT]]
 
 
 def every_start(structure: Structure, data: Dataset) -> list[CoarseStart]:
     """The polynomial balance's best starts and the slow flow's, best first."""
-    exact = coarse(structure, data, candidates(structure, data))[:6]
+    exact = balanced_starts(structure, data)[:6]
     return sorted([*exact, *physical_starts(structure, data)], key=lambda c: c.cost)
 
 
 def fit_from_balance(structure: Structure, data: Dataset) -> tuple[Fit | None, list[CoarseStart]]:
     """The fit from the best start of the polynomial balance, exact where the model is, if there is
     any; and all of these starts, best first."""
-    starts = coarse(structure, data, candidates(structure, data))
+    starts = balanced_starts(structure, data)
     return (fit_orbits(structure, data, starts[0].theta) if starts else None), starts
 
 

@@ -162,6 +162,14 @@ def test_which_forms_stand_for_others() -> None:
     assert "actuator_dynamics:pole" not in [e.key for e in alone]
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 4])
+def test_as_many_modes_are_placed_as_there_are_others(count: int) -> None:
+    """Of a tube with one mode none is: it had been the same start 36 times."""
+    placements = start.dense_placements(count)
+    assert {len(ratios) for ratios in placements} == {count}
+    assert len(set(placements)) == len(placements) == {0: 1, 1: 10}.get(count, 36)
+
+
 def test_signed_starts_have_both_signs_in_each_other_mode(tmp_path: Path) -> None:
     ready = thesis_campaign(tmp_path, 4, {})
     structure = Structure(3)

@@ -67,9 +67,11 @@ def _fitted(item: tuple[Structure, Dataset, Sequence[FloatArray], bool]) -> Fit:
     fit = fit_orbits(structure, rest, np.stack(thetas), continuation=(0.003, 0.0))
     if not anew or fit.chi2 < 2 * fit.dof:
         return fit
-    exact, _ = fit_from_balance(structure, rest)
-    fits = [fit] if exact is None else [fit, exact]
+    fits = [fit]
     # with a mode at the wrong place, one of these would leave no more than that
+    if not fit.chi2_per_dof < NEARLY:
+        exact, _ = fit_from_balance(structure, rest)
+        fits += [] if exact is None else [exact]
     if any(f.chi2_per_dof < NEARLY for f in fits):
         fits.append(fit_declared(structure, rest))
     return min(fits, key=lambda f: f.chi2)
