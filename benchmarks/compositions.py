@@ -18,10 +18,10 @@ import numpy as np
 from trace_study import to_campaign
 
 from identify import start, trace
+from identify.effect import Effect
 from identify.effects import CATALOGUE
 from identify.fit import Fit, fit_orbits
 from identify.identification import Prepared, prepare
-from identify.structure import Effect
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign
 from simulated_rig.effects import EFFECTS

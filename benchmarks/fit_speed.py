@@ -21,11 +21,12 @@ from scipy.integrate import solve_ivp
 from daq.service.reproduction.material import true_parameters
 from identify import balance, dataset, start
 from identify.dataset import Dataset
+from identify.effect import Conditions
 from identify.fit import fit_orbits
 from identify.harmonics import Harmonics
 from identify.record import Medium
 from identify.residual import OrbitResidual
-from identify.structure import Conditions, Structure
+from identify.structure import Structure
 from simulated_rig.plant import Plant
 from simulated_rig.presets import thesis_four_mode
 

@@ -6,10 +6,11 @@ model is made of, `identify.effects` for the candidates.
 """
 
 from identify.diagnosis import diagnose
+from identify.effect import Effect
 from identify.identification import identify
 from identify.record import Campaign, DeclaredModel, Medium, Run, Signal
 from identify.results import Assessment, Diagnosis, Identification
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 
 __all__ = [
     "Assessment",

@@ -23,18 +23,12 @@ import numpy.typing as npt
 
 from identify import dual
 from identify.dual import Dual
+from identify.effect import Conditions, at_the_flame
 from identify.newton import add_held, newton, slopes
 from identify.periods import period_matrices, period_waves, to_harmonics, to_time
+from identify.pieces import Characteristic, Preceded, Values
 from identify.polynomial import Polynomial
-from identify.structure import (
-    Characteristic,
-    Conditions,
-    Loop,
-    Preceded,
-    Structure,
-    Values,
-    at_the_flame,
-)
+from identify.structure import Loop, Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

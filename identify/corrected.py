@@ -15,8 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Batch, Dataset
+from identify.effect import Conditions
 from identify.fit import Fit, repeated
-from identify.structure import Conditions, Structure, Values
+from identify.pieces import Values
+from identify.structure import Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from identify.effect import Conditions, Effect
 from identify.harmonics import Harmonics, Microphones
 from identify.record import Medium
-from identify.structure import Conditions, Effect, Structure
+from identify.structure import Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

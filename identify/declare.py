@@ -27,9 +27,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from identify.effect import Effect
 from identify.effects import CATALOGUE
 from identify.record import DeclaredModel
-from identify.structure import NONLINEARITIES, Effect, Structure
+from identify.structure import NONLINEARITIES, Structure
 
 FORMAT = "model/1"
 PLACES = ("forward", "flame", "nonlinearity", "actuator", "sensor", "experiment")

@@ -16,6 +16,7 @@ import numpy as np
 from identify import assess, design, drive, start, trace
 from identify.chances import rank_correlation
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects import CANDIDATES
 from identify.executor import Executor, InProcess, Progress, one_thread
 from identify.fit import Fit
@@ -32,7 +33,7 @@ from identify.results import (
     TracedEffect,
     Verdict,
 )
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace import ALPHA, EVIDENCE, Cancelled, Tried
 from identify.trace.tried import LUCK, best_by_name
 from identify.trace.tried import tried as as_tried

@@ -20,9 +20,10 @@ import numpy.typing as npt
 from identify import balance
 from identify.balance import Orbits
 from identify.dataset import Batch
+from identify.effect import Conditions
 from identify.fit import Fit
 from identify.stability import Disturbed, leading_exponent, unstable_exponents
-from identify.structure import Conditions, Structure
+from identify.structure import Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

@@ -18,10 +18,12 @@ import numpy.typing as npt
 
 from identify.dataset import Batch
 from identify.descent import Descent, Evaluated, Residual, levenberg_marquardt
+from identify.effect import Conditions, Deviation, Effect
 from identify.effects.scatter import Direction
 from identify.parameters import Parameter
+from identify.pieces import Mode, Values
 from identify.residual import OrbitResidual, Pulled, Straightened, soften
-from identify.structure import Conditions, Deviation, Effect, Mode, Structure, Values
+from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]

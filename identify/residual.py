@@ -19,7 +19,8 @@ from identify import balance
 from identify.balance import Orbits
 from identify.dataset import Batch, whitener
 from identify.descent import Evaluated, Residual
-from identify.structure import Conditions, Structure
+from identify.effect import Conditions
+from identify.structure import Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

@@ -20,7 +20,9 @@ import numpy.typing as npt
 
 from identify import balance, periods
 from identify.balance import Orbits
-from identify.structure import Conditions, Structure, Values
+from identify.effect import Conditions
+from identify.pieces import Values
+from identify.structure import Structure
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

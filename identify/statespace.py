@@ -22,8 +22,10 @@ import numpy.typing as npt
 
 from identify import dual
 from identify.dual import Dual
+from identify.effect import Conditions, Effect
 from identify.fit import Fit
-from identify.structure import MODAL, Branch, Conditions, Effect, Mode, Structure, declared_modes
+from identify.pieces import Branch, Mode
+from identify.structure import MODAL, Structure, declared_modes
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]

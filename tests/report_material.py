@@ -14,6 +14,7 @@ import numpy.typing as npt
 from identify import balance
 from identify.assess import assess, lock_in
 from identify.dataset import build
+from identify.effect import Conditions
 from identify.fit import fit_orbits
 from identify.harmonics import Harmonics
 from identify.parameters import Estimate
@@ -27,7 +28,7 @@ from identify.results import (
     Residual,
     TracedEffect,
 )
-from identify.structure import Conditions, Structure
+from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
 FREE_HZ = 169.713

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
+from identify.effect import Effect, Known
 from identify.effects import CATALOGUE
 from identify.export import to_json, to_mat, to_state_space
 from identify.fit import Fit
 from identify.report.responses import closed_loop_poles, responses
 from identify.statespace import pade
-from identify.structure import Effect, Known, Structure
+from identify.structure import Structure
 from tests import report_material as material
 from tests.test_report_responses import as_fit
 

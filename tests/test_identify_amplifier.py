@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from identify.effect import Conditions, driven
 from identify.effects import by_key
 from identify.effects.scatter import DriveGain
-from identify.structure import Conditions, Structure, driven
+from identify.structure import Structure
 from tests.test_identify_balance import K, forced_conditions, theta
 
 SIZES = {

@@ -9,10 +9,12 @@ import pytest
 
 from identify import balance
 from identify.dual import Dual
+from identify.effect import Conditions, Effect
 from identify.effects import by_key
 from identify.effects.shaped import Setting, ShapedMemory
+from identify.pieces import Characteristic
 from identify.polynomial import Polynomial
-from identify.structure import Characteristic, Conditions, Effect, Loop, Structure, declared_modes
+from identify.structure import Loop, Structure, declared_modes
 from tests.identify_rig import FREE_HARMONICS, FREE_HZ, STEADY, true_values
 
 K = 7

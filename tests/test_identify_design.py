@@ -11,6 +11,7 @@ import pytest
 
 from daq.plan import parse_plan
 from identify import balance, dataset, design
+from identify.effect import Conditions, Effect
 from identify.effects import by_key
 from identify.fit import Fit, fit_orbits
 from identify.foresee import Past, Possible, possible
@@ -19,7 +20,7 @@ from identify.identification import Prepared
 from identify.quality import Quality
 from identify.reach import Option, reach_of
 from identify.record import Campaign, Medium, Run
-from identify.structure import Conditions, Effect, Structure
+from identify.structure import Structure
 from tests.identify_rig import true_values
 
 NOISE = 1e-3 * 2.4e6  # of the free cycle's velocity, in the thesis's units

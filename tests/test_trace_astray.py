@@ -16,8 +16,9 @@ from identify.executor import InProcess
 from identify.fit import _another_sings, fit_orbits
 from identify.identification import prepare
 from identify.parameters import ParameterSet
+from identify.pieces import Mode
 from identify.scatter import fit_scatter
-from identify.structure import MODAL, Mode, Structure
+from identify.structure import MODAL, Structure
 from identify.trace import selection
 from identify.trace.contests import at_the_same_place, in_their_places, reformed
 from identify.trace.exchange import in_each_form, in_other_forms, joins

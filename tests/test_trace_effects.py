@@ -12,6 +12,7 @@ import identify
 from identify import assess, balance, diagnosis, start, trace
 from identify.chances import chi2_tail
 from identify.descent import levenberg_marquardt
+from identify.effect import Conditions
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
@@ -34,7 +35,6 @@ from identify.report.gallery import save_figures
 from identify.residual import OrbitResidual
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
-from identify.structure import Conditions
 from identify.trace import selection
 from identify.trace.beside_chance import other_forms_beside_chance, without_law
 from identify.trace.claims import against_chance

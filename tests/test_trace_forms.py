@@ -15,6 +15,7 @@ import identify
 from daq.importers import open_campaign
 from identify import diagnosis, dual, profile, start, trace
 from identify.dataset import Dataset
+from identify.effect import driven
 from identify.effects import CATALOGUE, by_key
 from identify.effects.experiment import Step
 from identify.effects.scatter import SCATTERS
@@ -24,7 +25,6 @@ from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.residual import OrbitResidual, soften
 from identify.scatter import Spread, fit_scatter
-from identify.structure import driven
 from identify.trace import contests, selection, stages
 from identify.trace.contests import at_the_same_place
 from identify.trace.stages import try_scatters

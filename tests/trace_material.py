@@ -11,6 +11,7 @@ import numpy as np
 from daq.importers import open_campaign
 from identify import start, trace
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects import by_key
 from identify.effects.scatter import Scatter
 from identify.executor import InProcess, Progress
@@ -18,7 +19,7 @@ from identify.fit import Fit
 from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.record import Campaign
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace import selection
 from simulated_rig import build_config
 from simulated_rig.campaigns import RecordedRun, simulate_campaign, write_campaign

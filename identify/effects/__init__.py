@@ -1,13 +1,13 @@
 """Candidate effects: what a declared model may lack, one file a location of the loop.
 
 `CATALOGUE` lists every form of every effect in the order of `formats.md`. To add one, subclass
-`identify.structure.Effect` (parameters, starting values, and the one hook that it changes) and
+`identify.effect.Effect` (parameters, starting values, and the one hook that it changes) and
 append it to the list of its file.
 """
 
+from identify.effect import Effect
 from identify.effects import actuator, experiment, flame, forward, nonlinearity, sensor
 from identify.effects.scatter import SCATTERS
-from identify.structure import Effect
 
 CATALOGUE: tuple[Effect, ...] = (
     *forward.EFFECTS,

@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
+from identify.effect import Conditions, Effect, Known
 from identify.parameters import Parameter
-from identify.structure import Bent, Conditions, Effect, Known, Values
+from identify.pieces import Bent, Values
 
 FloatArray = npt.NDArray[np.float64]
 

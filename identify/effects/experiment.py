@@ -8,9 +8,11 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
+from identify.effect import Conditions, Effect, Known
 from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Mode, Structure, Values
+from identify.pieces import Mode, Values
+from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
 

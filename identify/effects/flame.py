@@ -6,8 +6,9 @@ from typing import Any
 import numpy as np
 
 from identify import dual
+from identify.effect import Conditions, Effect, Known
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Values
+from identify.pieces import Values
 
 FASTEST_S = 1e-6  # least lag of a flame that is plausible: 0.1 mm of flow at 100 m/s
 CANCELS = 0.2  # of a zero's frequency: so near to it a pole is as good as none

@@ -8,21 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from identify.effect import Conditions, Effect, Known
 from identify.parameters import Parameter
+from identify.pieces import Branch, Loss, Mode, Values
 from identify.polynomial import Polynomial
-from identify.structure import (
-    MODAL,
-    Branch,
-    Conditions,
-    Effect,
-    Known,
-    Loss,
-    Mode,
-    Structure,
-    Values,
-    declared_modes,
-    resonance,
-)
+from identify.structure import MODAL, Structure, declared_modes, resonance
 
 FloatArray = npt.NDArray[np.float64]
 

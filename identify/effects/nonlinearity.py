@@ -9,18 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
+from identify.effect import Conditions, Effect, Known
 from identify.parameters import Parameter
+from identify.pieces import Characteristic, Operator, Passed, Values
 from identify.polynomial import Polynomial
-from identify.structure import (
-    Characteristic,
-    Conditions,
-    Effect,
-    Known,
-    Operator,
-    Passed,
-    Structure,
-    Values,
-)
+from identify.structure import Structure
 
 Samples = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from identify import dual
+from identify.effect import Conditions, Effect
 from identify.effects.experiment import changed
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Mode, Values
+from identify.pieces import Mode, Values
 
 
 class Direction(Effect):

@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
+from identify.effect import Conditions, Effect, Known
 from identify.effects.heard import unbent
 from identify.parameters import Parameter
-from identify.structure import Conditions, Effect, Known, Mode, Values
+from identify.pieces import Mode, Values
 
 ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]

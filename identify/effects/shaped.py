@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from identify import dual
+from identify.effect import Conditions, Effect, Known
 from identify.effects.actuator import Distortion
 from identify.effects.experiment import course
 from identify.effects.forward import AcousticMode, NonlinearDamping
@@ -23,19 +24,8 @@ from identify.effects.nonlinearity import HigherOrder, play
 from identify.effects.scatter import Change, DriveGain, DrivePhase, Scatter, SensorGain
 from identify.effects.sensor import as_velocity, upper_pressure, with_leak
 from identify.parameters import Parameter
-from identify.structure import (
-    Bent,
-    Characteristic,
-    Conditions,
-    Effect,
-    Known,
-    Loss,
-    Mode,
-    Operator,
-    Passed,
-    Structure,
-    Values,
-)
+from identify.pieces import Bent, Characteristic, Loss, Mode, Operator, Passed, Values
+from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -14,10 +14,11 @@ import numpy.typing as npt
 
 from identify import dual
 from identify.dual import Dual
+from identify.effect import Conditions
 from identify.fit import Fit
 from identify.results import Assessment
 from identify.statespace import linear_poles, standing_still
-from identify.structure import Conditions, Loop
+from identify.structure import Loop
 
 FloatArray = npt.NDArray[np.float64]
 ComplexArray = npt.NDArray[np.complex128]

@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Batch, Dataset
+from identify.effect import Effect, at_the_flame, driven
+from identify.pieces import Mode, Values
 from identify.start.vectors import named, of_others, usual_placements
-from identify.structure import Effect, Mode, Structure, Values, at_the_flame, driven
+from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
-from identify.structure import Effect
 from identify.trace.exchange import in_each_form
 from identify.trace.fewer import part_of, with_fewer
 from identify.trace.scores import most_promising, scan, score_tests, stepped

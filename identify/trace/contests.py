@@ -10,8 +10,8 @@ from itertools import combinations
 import numpy as np
 
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.executor import Executor, Progress
-from identify.structure import Effect
 from identify.trace.exchange import Exchange, exchanged, forms_in_place, in_each_form
 from identify.trace.fewer import eliminate, part_of, with_fewer
 from identify.trace.stages import try_effects

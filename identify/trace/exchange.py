@@ -8,10 +8,11 @@ import numpy.typing as npt
 
 from identify import assess
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace.fewer import named_otherwise, part_of
 from identify.trace.matched import matched
 from identify.trace.stages import NO_RIVAL, beside, known_sizes

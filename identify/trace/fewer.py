@@ -6,8 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.fit import Fit, fit_orbits
-from identify.structure import MODAL, Effect, Structure
+from identify.structure import MODAL, Structure
 from identify.trace.claims import gain_p
 from identify.trace.stages import louder, loudness
 from identify.trace.tried import ALPHA, Tried, tried

@@ -11,9 +11,9 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits
-from identify.structure import Effect
 from identify.trace.exchange import joins
 from identify.trace.scores import most_promising, score_tests, stepped
 from identify.trace.stages import canonical

@@ -13,10 +13,11 @@ from itertools import combinations, product
 import numpy as np
 
 from identify.dataset import Dataset
+from identify.effect import Effect, Known
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
-from identify.structure import Effect, Known, Structure
+from identify.structure import Structure
 from identify.trace.stages import OF_MODES, canonical, known_sizes, likely_placements, renamed
 from identify.trace.tried import Tried, few_of_each, tried
 

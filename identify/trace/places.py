@@ -13,12 +13,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects.shaped import CHANCES, PIECES, Setting, Shaped, ShapedMemory
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits, no_better
 from identify.results import PARTLY, Whereabouts
 from identify.start import CoarseStart, candidates, coarse, physical_starts, polish
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace.exchange import joins
 from identify.trace.fewer import part_of
 from identify.trace.stages import (

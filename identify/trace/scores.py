@@ -15,11 +15,12 @@ import numpy.typing as npt
 
 from identify.chances import chi2_points, chi2_tail
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects.scatter import Scatter
 from identify.executor import Executor
 from identify.fit import Fit
 from identify.residual import OrbitResidual
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace.tried import first_of_each
 
 FloatArray = npt.NDArray[np.float64]

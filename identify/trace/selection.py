@@ -9,13 +9,14 @@ import numpy as np
 
 from identify.assess import lack_of_fit_p
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, InProcess, Progress
 from identify.fit import Fit, fit_orbits
 from identify.residual import soften
 from identify.start import fit_from_data, other_minima
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace.beside_chance import (
     LITTLE,
     beside_chance,

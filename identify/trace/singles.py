@@ -6,9 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.executor import Executor, InProcess, Progress
 from identify.fit import Fit
-from identify.structure import Effect, Structure
+from identify.structure import Structure
 from identify.trace.contests import at_the_same_place
 from identify.trace.exchange import in_other_forms
 from identify.trace.scores import ScoreTest, score_tests

@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from identify import assess
 from identify.dataset import Dataset
+from identify.effect import Effect, Known
 from identify.effects.scatter import Scatter
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits, no_better
@@ -32,7 +33,7 @@ from identify.start import (
     polish,
     signed_starts,
 )
-from identify.structure import Effect, Known, Structure
+from identify.structure import Structure
 from identify.trace.scores import ScoreTest, scan, score_tests, stepped
 from identify.trace.tried import Tried, best_by_name, few_of_each, first_of_each, misfit, tried
 

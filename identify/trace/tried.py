@@ -13,12 +13,12 @@ import numpy as np
 
 from identify import assess, corrected
 from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects import CANDIDATES
 from identify.effects.scatter import Scatter
 from identify.fit import Fit, log_determinant_of
 from identify.parameters import Estimate, Parameter
 from identify.scatter import Spread
-from identify.structure import Effect
 
 T = TypeVar("T")
 K = TypeVar("K", bound=Hashable)

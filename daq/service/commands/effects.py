@@ -10,7 +10,7 @@ from daq.errors import InputError
 from daq.service.commands.common import JsonOption, indented, write_json
 
 if TYPE_CHECKING:
-    from identify.structure import Effect
+    from identify.effect import Effect
 
 
 def effects(
