@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 import identify
-from identify import diagnosis
 from identify.effects import by_key
 from identify.effects.nonlinearity import HigherOrder
 from identify.effects.shaped import Setting, ShapedNonlinearity
 from identify.record import DeclaredModel
 from identify.structure import Structure
 from identify.trace import Tried
+from identify.verdict import Declared, judge
 from tests.trace_material import campaign, fitted, tried_as
 
 pytestmark = pytest.mark.no_cover
@@ -110,11 +110,11 @@ def test_only_what_has_come_to_an_end_is_claimed(
 ) -> None:
     """What was on its way still has no values."""
     monkeypatch.setattr(Tried, "plausible", True)
-    declared = diagnosis._Declared(tried_as(fitted(9, 40.0)), None, {}, 0.0)  # type: ignore[arg-type]
+    declared = Declared(tried_as(fitted(9, 40.0)), None, {}, 0.0)  # type: ignore[arg-type]
     fit = replace(fitted(10, 1.0), converged=reason == "converged", reason=reason)
     delay = tried_as(fit, "flame_delay")
     data = SimpleNamespace(validation=(), noise_floor=lambda batches: 1e-3)
-    found, _, said = diagnosis._judge(declared, [delay], data)  # type: ignore[arg-type]
+    found, _, said = judge(declared, [delay], data)  # type: ignore[arg-type]
     assert found == verdict
     if verdict == "unexplained":
         assert f"flame_delay comes near to the data, with no values: {reason}" in said

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 
 import identify
-from identify import assess, balance, diagnosis, start, trace
+from identify import assess, balance, start, trace, verdict
 from identify.chances import chi2_tail
 from identify.descent import levenberg_marquardt
 from identify.effect import Conditions
@@ -875,7 +875,7 @@ def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     assert "far less likely than a law" in found.explanation
     assert found.whereabouts is not None
     assert "forward" in found.whereabouts.likely
-    monkeypatch.setattr(diagnosis, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
+    monkeypatch.setattr(verdict, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
 
 

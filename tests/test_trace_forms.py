@@ -13,7 +13,7 @@ from scipy import stats
 
 import identify
 from daq.importers import open_campaign
-from identify import diagnosis, dual, profile, start, trace
+from identify import dual, profile, start, trace, verdict
 from identify.dataset import Dataset
 from identify.effect import driven
 from identify.effects import CATALOGUE, by_key
@@ -836,7 +836,7 @@ def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_nea
 
     def claimed(*tries: trace.Tried, floor: float = 1e-3, shape: trace.Tried = same) -> bool:
         ranked = sorted(tries, key=lambda t: t.fit.chi2)
-        return diagnosis._nearly(ranked, 27000.0 * 109, floor, [shape]) is drift
+        return verdict.nearly(ranked, 27000.0 * 109, floor, [shape]) is drift
 
     assert claimed(drift, more, afar)
     assert not claimed(drift, more, near)
@@ -848,7 +848,7 @@ def test_a_law_alone_that_leaves_a_trace_is_claimed_where_nothing_else_comes_nea
     assert not claimed(left(1.8, "parameter_drift:frequency"), more, floor=float("nan"))
     spread = Spread(drift.fit, None, {}, 0.0, "")  # type: ignore[arg-type]
     walk = replace(drift, spread=spread)
-    assert diagnosis._nearly([walk, afar], 27000.0 * 109, 1e-3, []) is None
+    assert verdict.nearly([walk, afar], 27000.0 * 109, 1e-3, []) is None
 
 
 def test_a_mirrored_fit_has_the_same_interval(tmp_path: Path) -> None:
