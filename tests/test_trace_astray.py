@@ -19,7 +19,7 @@ from identify.parameters import ParameterSet
 from identify.pieces import Mode
 from identify.scatter import fit_scatter
 from identify.structure import MODAL, Structure
-from identify.trace import selection
+from identify.trace import contesting, law_steps
 from identify.trace.contests import at_the_same_place, in_their_places, reformed
 from identify.trace.exchange import in_each_form, in_other_forms, joins
 from identify.trace.matched import matched
@@ -454,14 +454,14 @@ def test_what_explains_alone_once_something_is_left_out_is_contested(
         asked.extend(t.key_of_forms for t in tries)
         return [tried_as(fitted(12, 1.0), pole.key)]
 
-    monkeypatch.setattr(selection, "at_the_same_place", contested)
+    monkeypatch.setattr(contesting, "at_the_same_place", contested)
     monkeypatch.setattr(trace.Tried, "plausible", True)
     going = searching(fitted(11, 30.0), available=[pole])
-    going.contest_alone()
+    contesting.contest_alone(going)
     assert asked == []
     going.tried = [delay]
-    going.contest_alone()
-    going.contest_alone()
+    contesting.contest_alone(going)
+    contesting.contest_alone(going)
     assert asked == [("flame_delay",)]
     assert [t.key_of_forms for t in going.tried] == [("flame_delay",), (pole.key,)]
 
@@ -644,9 +644,9 @@ def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Pat
     assert 10 < base.chi2_per_dof < 100
     quadratic = by_key("actuator_nonlinearity:quadratic")
     going = replace(searching(base, available=(quadratic,)), data=ready.data)
-    going.alone(None)
+    law_steps.try_singles(going, None)
     assert not going.explained
-    going.each_alone(None)
+    law_steps.try_each_alone(going, None)
     (found,) = {t.key for t in going.tried if t.explains}
     assert found == ("actuator_nonlinearity",)
     best = min((t for t in going.tried if t.explains), key=lambda t: t.fit.chi2)

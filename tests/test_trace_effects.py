@@ -35,11 +35,12 @@ from identify.report.gallery import save_figures
 from identify.residual import OrbitResidual
 from identify.results import PLACES
 from identify.scatter import Spread, fit_scatter
-from identify.trace import selection
+from identify.trace import chance_steps
 from identify.trace.beside_chance import other_forms_beside_chance, without_law
 from identify.trace.claims import against_chance
 from identify.trace.exchange import in_other_forms
 from identify.trace.fewer import eliminate, named_otherwise
+from identify.trace.law_steps import plainest as plainest_of
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import chance_test, scan
 from identify.trace.stages import by_name, known_sizes, try_scatters
@@ -303,7 +304,7 @@ def test_the_best_fit_passes_the_drive_s_noise_on_where_nothing_explains_the_dat
     late = campaign(tmp_path / "late", 2, "flame_delay", drive_noise_v=0.1, delay_s=6e-4)
     found = identify.diagnose(late, catalogue=[by_key("flame_delay")])
     # where in the loop the rest lies takes longest, and is not asked here
-    for asked in ("trace.shaped", "trace.remembering", "trace.deviating", "trace.selection.shaped"):
+    for asked in ("trace.shaped", "trace.remembering", "trace.deviating", "trace.law_steps.shaped"):
         monkeypatch.setattr(f"identify.{asked}", lambda *args, **kwargs: [])
     poor = identify.diagnose(late, catalogue=[by_key("channel_mismatch:phase")])
     assert poor.verdict == "unexplained"
@@ -1024,21 +1025,21 @@ def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
         asked.extend(s.key for s in arguments[3])
         return []
 
-    monkeypatch.setattr(selection, "try_scatters", scattered)
+    monkeypatch.setattr(chance_steps, "try_scatters", scattered)
     for seek in ("beside_chance", "other_forms_beside_chance", "in_the_place_of_chance"):
-        monkeypatch.setattr(selection, seek, lambda *rest: [])
+        monkeypatch.setattr(chance_steps, seek, lambda *rest: [])
     going = searching(fitted(0, 500.0), scatters=SCATTERS)
     going.tried = [alone, law]
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    going.with_chance([law])
+    chance_steps.try_chance(going, [law])
     assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
     # and beside a law that comes to light within it alone (46105)
     asked.clear()
     within = trace.Tried((*law.effects, DRIVE), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
-    monkeypatch.setattr(selection, "beside_chance", lambda *rest: [within])
+    monkeypatch.setattr(chance_steps, "beside_chance", lambda *rest: [within])
     for simpler in ("simpler_beside_chance", "without_chance", "without_law"):
-        monkeypatch.setattr(selection, simpler, lambda *rest: [])
-    going.with_chance([])
+        monkeypatch.setattr(chance_steps, simpler, lambda *rest: [])
+    chance_steps.try_chance(going, [])
     assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
 
 
@@ -1056,14 +1057,14 @@ def test_a_law_beside_chance_is_claimed_only_after_the_other_kinds(
         asked.append(arguments)
         return []
 
-    monkeypatch.setattr(selection, "try_scatters", scattered)
+    monkeypatch.setattr(chance_steps, "try_scatters", scattered)
     monkeypatch.setattr(trace.Tried, "plausible", True)
     going = searching(fitted(0, 500.0), scatters=SCATTERS)
     going.tried = [coil]
-    assert going._beside_other_chance() == []
+    assert chance_steps.within_other_chance(going) == []
     assert asked == []
     going.tried = [best]
-    going._beside_other_chance()
+    chance_steps.within_other_chance(going)
     ((_, _, base, kinds, *_),) = asked
     assert base is best.fit  # from where they ended together
     assert {s.key for s in kinds} == {s.key for s in SCATTERS} - {"drive_scatter"}
@@ -1080,13 +1081,13 @@ def test_chance_is_tried_beside_what_may_be_true(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: t.names != offset.names))
     going = searching(fitted(0, 2e5), scatters=SCATTERS)
     monkeypatch.setattr(
-        selection._Searching, "_scattered", lambda self, _, base, kinds: asked.append(base) or []
+        chance_steps, "scattered", lambda going, _, base, kinds: asked.append(base) or []
     )
     going.tried = [offset, delay, pole, shape]
-    going._likely_beside_chance([offset])
+    chance_steps.likely_beside_chance(going, [offset])
     assert [f.chi2 for f in asked] == [delay.fit.chi2, pole.fit.chi2]
     asked.clear()
-    going._likely_beside_chance([delay])
+    chance_steps.likely_beside_chance(going, [delay])
     assert [f.chi2 for f in asked] == [pole.fit.chi2, shape.fit.chi2]
 
 
@@ -1117,11 +1118,11 @@ def test_the_plainest_law_is_grown_from_too() -> None:
     going = searching(fitted(11, 150.0))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(trace.Tried, "plausible", True)
-        (plainest,) = going.plainest([loss, delay, skew])
+        (plainest,) = plainest_of(going, [loss, delay, skew])
         assert plainest is delay
-        assert going.plainest([loss, skew]) == []  # leaves too much
+        assert plainest_of(going, [loss, skew]) == []  # leaves too much
         going.extended[delay.key_of_forms] = delay.fit.chi2
-        assert going.plainest([loss, delay, skew]) == []
+        assert plainest_of(going, [loss, delay, skew]) == []
 
 
 def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.residual import OrbitResidual, soften
 from identify.scatter import Spread, fit_scatter
-from identify.trace import contests, selection, stages
+from identify.trace import chance_steps, contests, stages
 from identify.trace.contests import at_the_same_place
 from identify.trace.stages import try_scatters
 from identify.trace.tried import BEATEN
@@ -620,18 +620,18 @@ def test_a_spread_that_comes_near_is_no_reason_not_to_look_coarsely(
     (thesis's rig, compression beside a walk)."""
     asked: list[str] = []
     nothing = replace(fitted(0, 0.0), chi2=np.inf)
-    monkeypatch.setattr(selection, "fit_from_data", lambda structure, soft: nothing)
-    monkeypatch.setattr(selection._Searching, "_scattered", lambda *rest: [])
+    monkeypatch.setattr(chance_steps, "fit_from_data", lambda structure, soft: nothing)
+    monkeypatch.setattr(chance_steps, "scattered", lambda *rest: [])
     monkeypatch.setattr(trace.Tried, "plausible", True)
     going = searching(fitted(0, 900.0), lambda share, text: asked.append(text))
     near = replace(beside(spread_of(900.0, ""), "flame_delay", 1e-9), fit=fitted(0, 6.0))
     law = replace(tried_as(fitted(1, 400.0), "flame_delay"), fit_p=0.0)
     going.tried = [near, law]
-    going.with_chance([])
+    chance_steps.try_chance(going, [])
     assert [t for t in asked if t.startswith("looking at the data to within")]
     asked.clear()
     going.tried.append(replace(law, fit=fitted(1, 4.0)))
-    going.with_chance([])
+    chance_steps.try_chance(going, [])
     assert not [t for t in asked if t.startswith("looking at the data to within")]
 
 
@@ -650,12 +650,12 @@ def test_beside_chance_a_law_s_forms_start_from_where_it_ended(
         return []
 
     monkeypatch.setattr(trace.Tried, "plausible", True)
-    monkeypatch.setattr(selection, "try_effects", lambda *a, **k: [mode, astray])
-    monkeypatch.setattr(selection, "in_each_form", lambda t, *a, **k: [loaded])
-    monkeypatch.setattr(selection._Searching, "_scattered", scattered)
+    monkeypatch.setattr(chance_steps, "try_effects", lambda *a, **k: [mode, astray])
+    monkeypatch.setattr(chance_steps, "in_each_form", lambda t, *a, **k: [loaded])
+    monkeypatch.setattr(chance_steps, "scattered", scattered)
     base = replace(fitted(0, 2.0), theta=np.zeros(11))
     going = searching(base, lambda share, text: None)
-    going._law_from_softened(going.data, base)
+    chance_steps.law_from_softened(going, going.data, base)
     assert [t.fit for t in asked] == [loaded.fit, mode.fit]
 
 

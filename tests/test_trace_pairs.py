@@ -11,7 +11,7 @@ from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
-from identify.trace import selection
+from identify.trace.contesting import DOUBT, one_more
 from identify.trace.contests import NEAR, varied
 from identify.trace.fewer import with_fewer
 from identify.trace.foreseen import foreseen
@@ -396,9 +396,9 @@ def test_of_two_that_explain_the_data_one_may_lack_another_form(tmp_path: Path) 
         far=False, progress=lambda share, text: None,
     )  # fmt: skip
     assert pairs[0].explains
-    assert pairs[0].fit_p < selection.DOUBT
+    assert pairs[0].fit_p < DOUBT
     going = replace(searching(base, available=[drift, pole, delay]), data=ready.data, tried=pairs)
-    assert not going.one_more(3)
+    assert not one_more(going, 3)
     best = trace.best_form([t for t in going.tried if t.explains])
     assert best.key_of_forms == (delay.key, drift.key)
     assert best.evidence < pairs[0].evidence - trace.EVIDENCE

@@ -20,7 +20,7 @@ from identify.identification import Prepared, prepare
 from identify.load import load_campaign
 from identify.record import Campaign
 from identify.structure import Structure
-from identify.trace import selection
+from identify.trace.under_way import UnderWay
 from simulated_rig import build_config
 from simulated_rig.campaigns import RecordedRun, simulate_campaign, write_campaign
 from simulated_rig.config import RigConfig
@@ -140,10 +140,10 @@ def searching(
     report: Progress = lambda share, text: None,
     available: Sequence[Effect] = (),
     scatters: Sequence[Scatter] = (),
-) -> selection._Searching:
+) -> UnderWay:
     """A search under way from there, on data of which nothing is looked at."""
     none = Dataset((), (), 0.0)
-    return selection._Searching(
+    return UnderWay(
         base.structure, none, base, InProcess(), report, tuple(available), (), tuple(scatters)
     )
 

@@ -4,14 +4,14 @@
    score tests (`scores`).
 2. Every form of every candidate effect is added to the declared model and refitted in stages
    (`stages`).
-3. If no single effect explains the data to within noise, run-to-run scatter is tried, and pairs
-   are grown from the best singles, then triples; scatter beside an effect, and effects beside
-   scatter, at more noise where both are gross (`selection`). Where even the best single leaves a
-   gross misfit and does not stand out, pairs are sought at once, from the slow flow corrected for
-   both effects (`pairs`); where no pair comes near, several modes may be lacking beside another
-   effect. An effect stays only if leaving it out makes the fit significantly worse (`fewer`); other
-   forms are tried, others in the place of each and of all (`contests`, by `exchange`), and what had
-   not converged is led `to_the_end`.
+3. If no single effect explains the data to within noise, run-to-run scatter is tried, and pairs are
+   grown from the best singles, then triples (`selection`, `law_steps`); scatter beside an effect,
+   and effects beside scatter, at more noise where both are gross (`chance_steps`). Where even the
+   best single leaves a gross misfit and does not stand out, pairs are sought at once, from the slow
+   flow corrected for both effects (`pairs`); where no pair comes near, several modes may be lacking
+   beside another effect. An effect stays only if leaving it out makes the fit significantly worse
+   (`fewer`); other forms are tried, others in the place of each and of all (`contests`, by
+   `exchange`), and what had not converged is led `to_the_end`.
 4. What explains the data must also have come to values, predict the validation runs, lie in its
    plausible range, take most of the misfit away by more than chance, and have no rival: another
    effect that does as well, complexity counted (`tried`), nor, where it leaves more than noise

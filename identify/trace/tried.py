@@ -323,3 +323,9 @@ def foremost(tries: Sequence[Tried]) -> Tried | None:
     least = min((t.fit.chi2 for t in tries), default=np.inf)
     near = [t for t in tries if t.fit.chi2 <= 3 * least]
     return min(near, key=lambda t: (len(t.effects), t.fit.chi2), default=None)
+
+
+def least(tries: Sequence[Tried]) -> float:
+    """χ²/dof of the best of them that may be true; 0 of none."""
+    likely = (t.fit.chi2_per_dof for t in tries if t.plausible)
+    return min(likely, default=np.inf if tries else 0.0)
