@@ -40,7 +40,7 @@ from identify.fit import Fit
 from identify.identification import prepare
 from identify.record import Campaign, DeclaredModel, Medium, Run, Signal
 from identify.trace import try_effects, usable
-from identify.trace.stages import try_scatters
+from identify.trace.spreads import try_scatters
 from simulated_rig import build_config
 from simulated_rig.campaigns import SimulatedCampaign, simulate_campaign
 from simulated_rig.config import RigConfig

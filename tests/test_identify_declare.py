@@ -17,7 +17,7 @@ from identify.harmonics import RecordError
 from identify.identification import declared_structure, fit_structure, prepare
 from identify.load import load_campaign
 from identify.record import DeclaredModel
-from identify.trace.stages import usable
+from identify.trace.usable import usable
 from tests.identify_coefficients import WIDE, clean, drawn
 
 CASE = Path(__file__).parent / "data" / "b-flame-delay"

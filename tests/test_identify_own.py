@@ -12,7 +12,7 @@ from identify.effects.scatter import SCATTERS, DrivePhase, Scatter
 from identify.fit import fit_orbits
 from identify.own import Own, settle
 from identify.scatter import fit_scatter
-from identify.trace.stages import known_sizes
+from identify.trace.sizes import known_sizes
 from simulated_rig import build_config
 from simulated_rig.config import Drift
 from simulated_rig.drift import change_at

@@ -24,7 +24,8 @@ from identify.trace.contests import at_the_same_place, in_their_places, reformed
 from identify.trace.exchange import in_each_form, in_other_forms, joins
 from identify.trace.matched import matched
 from identify.trace.scores import scan, stepped
-from identify.trace.stages import known_sizes, slow_flow_starts
+from identify.trace.sizes import known_sizes
+from identify.trace.stages import slow_flow_starts
 from identify.trace.tried import tried
 from simulated_rig.campaigns import RecordedRun
 from simulated_rig.effects import make_effect

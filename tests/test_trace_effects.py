@@ -42,8 +42,10 @@ from identify.trace.exchange import in_other_forms
 from identify.trace.fewer import eliminate, named_otherwise
 from identify.trace.law_steps import plainest as plainest_of
 from identify.trace.places import deviating, remembering, shaped, whereabouts
+from identify.trace.restated import by_name
 from identify.trace.scores import chance_test, scan
-from identify.trace.stages import by_name, known_sizes, try_scatters
+from identify.trace.sizes import known_sizes
+from identify.trace.spreads import try_scatters
 from identify.trace.to_the_end import settled
 from identify.trace.tried import tried
 from simulated_rig import build_config

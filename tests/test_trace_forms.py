@@ -25,9 +25,9 @@ from identify.load import load_campaign
 from identify.polynomial import Polynomial
 from identify.residual import OrbitResidual, soften
 from identify.scatter import Spread, fit_scatter
-from identify.trace import chance_steps, contests, stages
+from identify.trace import chance_steps, contests, spreads
 from identify.trace.contests import at_the_same_place
-from identify.trace.stages import try_scatters
+from identify.trace.spreads import try_scatters
 from identify.trace.tried import BEATEN
 from simulated_rig import build_config
 from simulated_rig.campaigns import (
@@ -408,7 +408,7 @@ def test_a_spread_must_leave_nothing_but_noise(
     for p_value, explains in ((0.01, False), (0.1, True)):
         chi2 = float(stats.chi2.isf(p_value, real.fit.dof))
         lacking = replace(real, fit=replace(real.fit, chi2=chi2), objection="")
-        monkeypatch.setattr(stages, "fit_scatter", lambda *_, given=lacking: given)
+        monkeypatch.setattr(spreads, "fit_scatter", lambda *_, given=lacking: given)
         (found,) = try_scatters(ready.structure, ready.data, base, [drive], InProcess())
         assert found.adequate
         assert found.explains is explains

@@ -17,7 +17,7 @@ from identify.trace.fewer import with_fewer
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place
-from identify.trace.stages import renamed
+from identify.trace.restated import renamed
 from identify.trace.tried import tried
 from tests.trace_material import (
     fitted,

@@ -25,6 +25,7 @@
    where one alone contradicts the declared model, its recording is doubted (`lone`).
 """
 
+from identify.trace.again import started_again
 from identify.trace.claims import (
     accounts,
     against_chance,
@@ -40,8 +41,9 @@ from identify.trace.lone import lone_run
 from identify.trace.places import deviating, remembering, shaped, whereabouts
 from identify.trace.scores import ScoreTest, family_p, score_tests
 from identify.trace.selection import Cancelled, refitted, search, without_effects
-from identify.trace.stages import started_again, try_effects, usable
+from identify.trace.stages import try_effects
 from identify.trace.tried import ALPHA, EVIDENCE, Tried, astray, best_by_name, best_form, foremost
+from identify.trace.usable import usable
 
 __all__ = [
     "ALPHA",

@@ -17,7 +17,9 @@ from identify.fit import Fit, fit_orbits
 from identify.trace.exchange import in_each_form
 from identify.trace.fewer import part_of, with_fewer
 from identify.trace.scores import most_promising, scan, score_tests, stepped
-from identify.trace.stages import known_sizes, try_effects, try_scatters
+from identify.trace.sizes import known_sizes
+from identify.trace.spreads import try_scatters
+from identify.trace.stages import try_effects
 from identify.trace.tried import Tried, best_by_name, best_form, first_of_each, misfit, tried
 
 FloatArray = npt.NDArray[np.float64]

@@ -1,6 +1,6 @@
 """Steps of the search that put runs down to chance: a spread alone, beside a law, or within one.
 
-What is found goes to `UnderWay.tried`; the sets themselves come from `beside_chance` and `stages`.
+What is found goes to `UnderWay.tried`; the sets come from `beside_chance`, `spreads` and `stages`.
 """
 
 from collections.abc import Sequence
@@ -27,7 +27,8 @@ from identify.trace.beside_chance import (
 )
 from identify.trace.claims import NO_CHANCE, against_chance
 from identify.trace.exchange import in_each_form
-from identify.trace.stages import try_effects, try_scatters
+from identify.trace.spreads import try_scatters
+from identify.trace.stages import try_effects
 from identify.trace.tried import (
     ALPHA,
     EVIDENCE,

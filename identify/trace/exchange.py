@@ -15,7 +15,8 @@ from identify.start import coarse
 from identify.structure import Structure
 from identify.trace.fewer import named_otherwise, part_of
 from identify.trace.matched import matched
-from identify.trace.stages import NO_RIVAL, beside, known_sizes
+from identify.trace.sizes import beside, known_sizes
+from identify.trace.stages import NO_RIVAL
 from identify.trace.to_the_end import FARTHEST
 from identify.trace.tried import ALPHA, Tried, key_of_forms, misfit, tried
 

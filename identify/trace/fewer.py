@@ -10,7 +10,7 @@ from identify.effect import Effect
 from identify.fit import Fit, fit_orbits
 from identify.structure import MODAL, Structure
 from identify.trace.claims import gain_p
-from identify.trace.stages import louder, loudness
+from identify.trace.sizes import louder, loudness
 from identify.trace.tried import ALPHA, Tried, tried
 
 NEEDLESS = 100.0  # of χ²: what leaving an effect out adds at most, if it is to be left out

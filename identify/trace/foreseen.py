@@ -15,8 +15,8 @@ from identify.effect import Effect
 from identify.executor import Executor, InProcess
 from identify.fit import Fit, fit_orbits
 from identify.trace.exchange import joins
+from identify.trace.restated import canonical
 from identify.trace.scores import most_promising, score_tests, stepped
-from identify.trace.stages import canonical
 from identify.trace.tried import Tried, few_of_each, key_of_forms, misfit, tried
 
 BESIDE = 3  # effects that are looked at beside each single, of those that promise most

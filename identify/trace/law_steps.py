@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from identify.trace.again import started_again
 from identify.trace.beside_chance import LITTLE
 from identify.trace.chance_steps import scattered
 from identify.trace.contests import reformed
@@ -15,9 +16,10 @@ from identify.trace.fewer import eliminate
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import pairs_from_afar
 from identify.trace.places import shaped, within_a_place
+from identify.trace.restated import as_declared
 from identify.trace.scores import ScoreTest
 from identify.trace.singles import Alone, by_itself, try_alone
-from identify.trace.stages import as_declared, started_again, try_effects
+from identify.trace.stages import try_effects
 from identify.trace.to_the_end import led_on
 from identify.trace.tried import (
     GROSS,

@@ -18,7 +18,9 @@ from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
 from identify.start import CoarseStart, dense_placements, polish, signed_starts
 from identify.structure import Structure
-from identify.trace.stages import OF_MODES, canonical, known_sizes, likely_placements, renamed
+from identify.trace.restated import canonical, renamed
+from identify.trace.sizes import known_sizes
+from identify.trace.stages import OF_MODES, likely_placements
 from identify.trace.tried import Tried, few_of_each, tried
 
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage

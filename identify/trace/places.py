@@ -22,18 +22,13 @@ from identify.start import CoarseStart, candidates, coarse, physical_starts, pol
 from identify.structure import Structure
 from identify.trace.exchange import joins
 from identify.trace.fewer import part_of
-from identify.trace.stages import (
-    ROUGH,
-    known_sizes,
-    knows_pressure,
-    renamed,
-    shares_of,
-    try_effects,
-    try_scatters,
-    usable,
-)
+from identify.trace.restated import renamed
+from identify.trace.sizes import ROUGH, known_sizes, shares_of
+from identify.trace.spreads import try_scatters
+from identify.trace.stages import try_effects
 from identify.trace.tried import EVIDENCE, Tried, best_by_name, first_of_each, misfit
 from identify.trace.tried import tried as as_tried
+from identify.trace.usable import knows_pressure, usable
 
 CLEARLY = 3.0  # times the χ² of the best place: what leaves more is ruled out
 TAKEN = 0.3  # share of the excess over noise that the best place may leave …

@@ -31,17 +31,9 @@ from identify.trace.law_steps import (
     try_singles,
 )
 from identify.trace.scores import ScoreTest
-from identify.trace.stages import usable
-from identify.trace.tried import (
-    GROSS,
-    Tried,
-    best_by_name,
-    best_form,
-    least,
-    misfit,
-    tried,
-)
+from identify.trace.tried import GROSS, Tried, best_by_name, best_form, least, misfit, tried
 from identify.trace.under_way import UnderWay, as_a_parent
+from identify.trace.usable import usable
 
 STANDS_OUT = 30.0  # times less misfit than with any other effect
 

@@ -10,10 +10,11 @@ from identify.effect import Effect
 from identify.executor import Executor, InProcess, Progress
 from identify.fit import Fit
 from identify.structure import Structure
+from identify.trace.again import started_again
 from identify.trace.contests import at_the_same_place
 from identify.trace.exchange import in_other_forms
 from identify.trace.scores import ScoreTest, score_tests
-from identify.trace.stages import started_again, try_effects
+from identify.trace.stages import try_effects
 from identify.trace.to_the_end import led_on
 from identify.trace.tried import Tried, misfit
 

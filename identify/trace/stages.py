@@ -13,33 +13,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from identify import assess
 from identify.dataset import Dataset
 from identify.effect import Effect, Known
-from identify.effects.scatter import Scatter
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits, no_better
-from identify.scatter import Spread, fit_scatter
 from identify.start import (
     CoarseStart,
     candidates,
     coarse,
-    corrected,
     dense_placements,
     distinct,
     every_start,
-    fit_from_data,
     physical_starts,
     polish,
     signed_starts,
 )
 from identify.structure import Structure
+from identify.trace.restated import canonical, renamed
 from identify.trace.scores import ScoreTest, scan, score_tests, stepped
-from identify.trace.tried import Tried, best_by_name, few_of_each, first_of_each, misfit, tried
+from identify.trace.sizes import ROUGH, beside, known_sizes, shares_of
+from identify.trace.tried import Tried, few_of_each, first_of_each, misfit, tried
 
 FloatArray = npt.NDArray[np.float64]
 
-AGAIN = 30.0  # χ²/dof of a refitted effect that a bad start may have caused
 REACH = 10.0  # times the best χ²: what lies beyond is refitted only if nothing nearer explains
 SURELY = 4  # so many are refitted in any case
 PROMISED = 0.4  # share of χ² that a small effect would take away: refitted straight from the base
@@ -48,31 +44,8 @@ RIVAL_FORMS = 2  # of an effect that are led in from afar where another explains
 OWN = 12  # starting values of an effect that are all led in from afar
 SHAPES = 4  # so many are started from of an effect whose shape is unknown …
 STEPPED = 2  # … and from so many with a step of all unknowns
-ROUGH = 0.05  # share of a coefficient's size that counts as noise where the search begins afar
 NO_RIVAL = 30.0  # times what noise leaves: what promises no less is none of what explains the data
 FINE = 0.015  # share of noise below which all harmonics are looked at
-
-
-def known_sizes(data: Dataset, fit: Fit) -> Known:
-    """Sizes that starting values lean on."""
-    v = fit.values
-    n = fit.structure.mode_count
-    forced = [b for b in data.fit if not b.free]
-    velocity = float(np.median(np.concatenate([np.abs(b.measured[:, 0]) for b in forced])))
-    drive = float(np.max(np.concatenate([np.abs(b.at.drive[:, 0]) for b in forced])))
-    omega = np.concatenate([b.at.omega for b in forced]) / (2 * np.pi)
-    pole = 2 * np.pi * v.get("flame.pole_hz", data.free_hz)
-    return Known(
-        free_hz=data.free_hz,
-        modes_hz=tuple(v[f"mode{i}.frequency_hz"] for i in range(1, n + 1)),
-        modes_damping=tuple(v[f"mode{i}.damping"] for i in range(1, n + 1)),
-        flame_residues=tuple(v[f"mode{i}.flame_residue"] for i in range(1, n + 1)),
-        speaker_residues=tuple(v[f"mode{i}.speaker_residue"] for i in range(1, n + 1)),
-        flame_input_amplitude=velocity / abs(2j * np.pi * data.free_hz + pole),
-        velocity_amplitude=velocity,
-        drive_amplitude=drive,
-        band_hz=(float(omega.min()), float(omega.max())),
-    )
 
 
 @dataclass(frozen=True)
@@ -106,34 +79,6 @@ class _Task:
     def proposals(self) -> list[tuple[float, ...]]:
         """The effect's own starting values."""
         return [tuple(row) for row in self.effect.starts(self.known)]
-
-
-def louder(theta: FloatArray, names: Sequence[str], gain: float) -> FloatArray:
-    """Unknowns of these names, the speaker `gain` times as loud."""
-    spoken = [n.endswith("speaker_residue") for n in names]
-    return np.where(spoken, theta * gain, theta)
-
-
-def loudness(data: Dataset, effects: Sequence[Effect], p: Mapping[str, float]) -> float:
-    """What effects of these values make of the drive at the free frequency: a factor whose sign
-    is that of its real part (a resonance below it turns the sign), 1 where it says nothing."""
-    at = data.fit[0].at.take(np.array([0]))
-    s = np.array([[2j * np.pi * data.free_hz]])
-    gain = complex(np.prod([np.ravel(e.actuator(p, at, s))[0] for e in effects]))
-    signed = float(np.copysign(abs(gain), gain.real))
-    return signed if np.isfinite(signed) and signed != 0 else 1.0
-
-
-def beside(
-    structure: Structure,
-    theta: FloatArray,
-    data: Dataset,
-    effect: Effect,
-    values: Sequence[float],
-) -> FloatArray:
-    """Unknowns of `structure` as they are with one more effect of these values: as loud."""
-    p = {q.name: v for q, v in zip(effect.parameters, values, strict=True)}
-    return louder(theta, structure.parameters.names, 1 / loudness(data, [effect], p))
 
 
 def _first_stage(task: _Task) -> list[CoarseStart]:
@@ -247,62 +192,6 @@ def _balanced(task: _Task) -> Fit | None:
     if not starts:
         return None
     return canonical(fit_orbits(larger, task.data, starts[0].theta), task.data)
-
-
-def as_declared(item: tuple[Structure, Dataset, Effect]) -> Fit:
-    """An effect fitted from the data alone, as if the model had been declared with it."""
-    structure, data, effect = item
-    richer = effect.restated(structure)
-    assert richer is not None
-    larger, found = structure.with_effects(effect), fit_from_data(richer, data)
-    return fit_orbits(larger, data, by_name(effect, larger, found.values), continuation=(0.0,))
-
-
-def canonical(fit: Fit, data: Dataset) -> Fit:
-    """The same fit with its effects' parameters named by the effects' own rules."""
-    structure = fit.structure
-    plain = replace(structure, effects=())
-    for effect in structure.effects:
-        if effect.restated(plain) is None:
-            continue
-        p = {**fit.values, **effect.to_restated(plain, fit.values)}
-        theta = by_name(effect, structure, p)
-        if np.allclose(theta, fit.theta, rtol=1e-9, atol=1e-12):
-            continue
-        renamed = fit_orbits(structure, data, theta, continuation=(0.0,))
-        # beside an effect that speaks of the modes by number, another name is another model
-        if renamed.converged >= fit.converged and renamed.chi2 < fit.chi2 + 1.0:
-            fit = renamed
-    return fit
-
-
-def by_name(effect: Effect, larger: Structure, p: Mapping[str, float]) -> FloatArray:
-    """Unknowns of `larger`, of which `effect` is one, from values of the richer structure that says
-    the same as the declared model with it, and of what else is in `larger`."""
-    plain = replace(larger, effects=())
-    names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
-    now = {**p, **dict(zip(names, effect.from_restated(plain, p), strict=True))}
-    return larger.parameters.to_internal([now[n] for n in larger.parameters.names])
-
-
-def renamed(
-    effect: Effect, larger: Structure, richer: Structure, thetas: Iterable[FloatArray]
-) -> list[FloatArray]:
-    """Unknowns of `larger`, of which `effect` is one, from those of the `richer` structure that
-    says the same."""
-    return [by_name(effect, larger, richer.parameters.plain(theta)) for theta in thetas]
-
-
-def shares_of(base: Fit, data: Dataset) -> tuple[float, float, float]:
-    """Noise of the stages as shares of each coefficient's size: of the size of the misfit.
-
-    Much coarser, and an effect that explains it does no better than one that does not.
-    """
-    misfit = assess.relative_error(
-        [assess.predict(base.structure, base.theta, b) for b in data.fit]
-    )
-    first = float(np.clip(2 * misfit, 1e-4, ROUGH)) if np.isfinite(misfit) else ROUGH
-    return first, first / 5, min(0.003, first / 15)
 
 
 def _one_stands_out(costs: Sequence[float], share: float) -> bool:
@@ -428,53 +317,6 @@ def _refits(
     return out
 
 
-def started_again(singles: Sequence[Tried], data: Dataset, executor: Executor) -> list[Tried]:
-    """The best of each effect started once more as if its values were known.
-
-    A gross effect leads the fit of everything else astray, yet is often nearly right itself: with
-    the data corrected for it, the declared model's own starting values serve again.
-    """
-    best = [t for t in best_by_name(singles) if t.fit.chi2_per_dof > AGAIN][:4]
-    again = [
-        tried(t.effects, fit, data)
-        for t, fit in zip(best, executor.map(_again, [(t, data) for t in best]), strict=True)
-        if np.isfinite(fit.chi2) and fit.chi2 < t.fit.chi2
-    ]
-    return sorted([*singles, *again], key=misfit)
-
-
-def _again(item: tuple[Tried, Dataset]) -> Fit:
-    t, data = item
-    larger, plain = t.fit.structure, replace(t.fit.structure, effects=())
-    values = t.fit.values
-    row = [values[q.name] for e in t.effects for q in e.parameters]
-    own = t.fit.theta[len(plain.parameters) :]
-    rough = data.coarse()
-    clean = corrected(data, t.effects, values)
-    exact = [] if clean is None else [np.r_[theta, own] for theta in candidates(plain, clean)]
-    exact += [] if clean is None else _restated_starts(t, clean)
-    starts = coarse(larger, rough, exact)[:5] + physical_starts(larger, rough, [row])[:5]
-    polished = polish(larger, rough, starts, shares=(0.05, 0.01), iterations=10)[:3]
-    thetas = np.stack([*(s.theta for s in polished), t.fit.theta])
-    worse = t.fit.chi2 / data.residuals
-    steps = (0.003, 0.0)
-    return fit_orbits(larger, data, thetas, continuation=steps, iterations=100, hopeless=worse)
-
-
-def _restated_starts(t: Tried, clean: Dataset) -> list[FloatArray]:
-    """Starts of `t`, of several effects, from the richer structure that says the same as one of
-    them, on data corrected for the others."""
-    if len(t.effects) == 1:
-        return []
-    plain = replace(t.fit.structure, effects=())
-    for effect in t.effects:
-        richer = effect.restated(plain)
-        if richer is not None:
-            found = [richer.parameters.plain(theta) for theta in candidates(richer, clean)]
-            return [by_name(effect, t.fit.structure, {**t.fit.values, **p}) for p in found]
-    return []
-
-
 def _best(
     staged: Sequence[tuple[_Task, list[CoarseStart]]], keep: int, forms: int
 ) -> list[tuple[_Task, list[CoarseStart]]]:
@@ -509,44 +351,3 @@ def likely_placements(structure: Structure, data: Dataset) -> tuple[tuple[float,
         if ratio not in out:
             out.append(ratio)
     return tuple(out[:2])
-
-
-def try_scatters(
-    structure: Structure,
-    data: Dataset,
-    base: Fit,
-    scatters: Sequence[Scatter],
-    run: Executor,
-    most: float = np.inf,
-    far: bool = False,
-) -> list[Tried]:
-    """Each kind of random difference from run to run on top of `structure`, but for those whose
-    evidence (χ² + p ln n) is surely beyond `most`; from the slow flow too where `base` is `far`."""
-    left = most - base.theta.size * float(np.log(data.residuals))  # of χ² and penalty
-    spreads = run.map(_scattered, [(structure, data, base, s, left, far) for s in scatters])
-    return [
-        replace(tried((*structure.effects, s), spread.fit, spread.data), spread=spread)
-        for s, spread in zip(scatters, spreads, strict=True)
-        if spread is not None
-    ]
-
-
-def _scattered(item: tuple[Structure, Dataset, Fit, Scatter, float, bool]) -> Spread | None:
-    return fit_scatter(*item)
-
-
-def knows_pressure(data: Dataset) -> bool:
-    """Whether a pressure was measured beside the velocity."""
-    return any(np.any(b.at.pressure != 0) for b in data.fit)
-
-
-def usable(effect: Effect, data: Dataset, structure: Structure) -> bool:
-    """Whether the effect can be added to this declared model and asked of these data."""
-    if isinstance(effect, Scatter):  # no parameter describes it: `try_scatters`
-        return False
-    if not effect.extends(structure):
-        return False
-    if "flame_pole" in effect.needs and structure.flame_order == 0:
-        return False
-    absent = "velocity" if knows_pressure(data) else "pressure"
-    return absent not in effect.needs

@@ -8,7 +8,7 @@ from identify.dataset import Dataset
 from identify.executor import Executor
 from identify.fit import Fit, fit_orbits
 from identify.start import coarse
-from identify.trace.stages import known_sizes
+from identify.trace.sizes import known_sizes
 from identify.trace.tried import Tried, best_form, best_of_each_form, tried
 
 UNSETTLED = 60.0  # of χ² + p ln n: within that, led on or in another form, it may yet be a rival
