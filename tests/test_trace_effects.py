@@ -1,51 +1,29 @@
-"""Effects that need more than one fit: spreads, gross ones, shapes that nobody knows."""
+"""Effects that need more than one fit: gross ones, small ones beside them, forms led to the end."""
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
 import identify
-from identify import assess, balance, start, trace, verdict
+from identify import assess, balance, start, trace
 from identify.chances import chi2_tail
 from identify.descent import levenberg_marquardt
 from identify.effect import Conditions
 from identify.effects import CATALOGUE, by_key
 from identify.effects.forward import SideResonator
 from identify.effects.scatter import SCATTERS
-from identify.effects.shaped import (
-    LAGS,
-    Setting,
-    Shaped,
-    ShapedActuator,
-    ShapedExperiment,
-    ShapedFlame,
-    ShapedForward,
-    ShapedNonlinearity,
-    lag,
-)
 from identify.executor import InProcess
-from identify.fit import Fit, fit_orbits
-from identify.identification import Prepared
-from identify.parameters import Estimate
-from identify.report.gallery import save_figures
+from identify.fit import fit_orbits
 from identify.residual import OrbitResidual
-from identify.results import PLACES
-from identify.scatter import Spread, fit_scatter
-from identify.trace import chance_steps
-from identify.trace.beside_chance import other_forms_beside_chance, without_law
-from identify.trace.claims import against_chance
+from identify.scatter import Spread
 from identify.trace.exchange import in_other_forms
 from identify.trace.fewer import eliminate, named_otherwise
 from identify.trace.law_steps import plainest as plainest_of
-from identify.trace.places import deviating, remembering, shaped, whereabouts
-from identify.trace.restated import by_name
-from identify.trace.scores import chance_test, scan
+from identify.trace.scores import scan
 from identify.trace.sizes import known_sizes
-from identify.trace.spreads import try_scatters
 from identify.trace.to_the_end import settled
 from identify.trace.tried import tried
 from simulated_rig import build_config
@@ -53,9 +31,7 @@ from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import random_rig
 from tests.trace_material import (
     campaign,
-    drawn_values,
     fitted,
-    of_runs,
     only,
     record,
     recorded,
@@ -68,71 +44,6 @@ from tests.trace_material import (
 pytestmark = pytest.mark.no_cover  # measuring coverage doubles the time; the cases do it
 
 DRIVE = next(s for s in SCATTERS if s.name == "drive_scatter")
-FLAME = next(s for s in SCATTERS if s.name == "flame_gain_modulation")
-WALK = next(s for s in SCATTERS if s.name == "parameter_drift")
-
-
-def deviance(ready: Prepared, base: Fit, name: str) -> float:
-    (scatter,) = [s for s in SCATTERS if s.name == name]
-    spread = fit_scatter(ready.structure, ready.data, base, scatter)
-    return np.inf if spread is None else spread.fit.chi2 + spread.penalty
-
-
-@pytest.mark.parametrize(
-    ("name", "truth"),
-    [
-        ("drive_scatter", {"gain_rms": 0.004, "phase_rms_rad": 0.004}),
-        ("flame_gain_modulation", {"modulation_rms": 0.01, "corner_hz": 0.5}),
-    ],
-)
-def test_a_spread_from_run_to_run_is_told_by_its_direction(
-    tmp_path: Path, name: str, truth: dict[str, float]
-) -> None:
-    ready, base = recorded(tmp_path, 3, name, **truth)
-    assert assess.lack_of_fit_p(base.chi2, base.dof) < 1e-6
-    (scatter,) = [s for s in SCATTERS if s.name == name]
-    spread = fit_scatter(ready.structure, ready.data, base, scatter)
-    assert spread is not None
-    assert spread.objection == ""
-    assert assess.lack_of_fit_p(spread.fit.chi2, spread.fit.dof) > 1e-3
-    # held-out runs are scattered too: what error is to be expected of them says so
-    held_out = zip(spread.data.validation, ready.data.validation, strict=True)
-    assert all((wide.noise[:, 0] > 10 * plain.noise[:, 0]).all() for wide, plain in held_out)
-    other = "flame_gain_modulation" if name == "drive_scatter" else "drive_scatter"
-    mine = spread.fit.chi2 + spread.penalty
-    assert mine + trace.EVIDENCE < deviance(ready, base, other)
-    if name == "drive_scatter":
-        size = spread.sizes["drive_scatter.gain_rms"]
-        assert abs(np.log(size.value / 0.004)) < 3 * size.stderr / size.value
-
-
-@pytest.mark.parametrize("scattered", [True, False])
-def test_chance_beside_a_law_that_leaves_little(tmp_path: Path, scattered: bool) -> None:
-    """That the flame's gain differs from run to run is told beside a delay of the flame by how the
-    runs deviate, where all residuals together need be no larger than noise (55030)."""
-    effects: dict[str, dict[str, float]] = {"flame_delay": {"delay_s": 4e-4}}
-    if scattered:
-        effects["flame_gain_modulation"] = {"modulation_rms": 0.004, "corner_hz": 0.5}
-    ready = thesis_campaign(tmp_path, 5, effects, noise_db=45.0)
-    law = only(ready, start.fit_from_data(ready.structure, ready.data), "flame_delay")
-    found = {s.name: chance_test(ready.structure.with_effects(*law.effects), ready.data, law.fit, s)
-             for s in SCATTERS}  # fmt: skip
-    p_values = {name: test.p_value for name, test in found.items() if test is not None}
-    assert set(p_values) == {s.name for s in SCATTERS}
-    if scattered:
-        assert p_values["flame_gain_modulation"] < 1e-6
-        assert min(p_values, key=lambda name: p_values[name]) == "flame_gain_modulation"
-    else:
-        assert min(p_values.values()) > 1e-3
-
-
-def test_what_follows_the_drive_is_no_chance(tmp_path: Path) -> None:
-    """A compressing speaker deviates along the drive, run by run, but by a law."""
-    ready, base = recorded(tmp_path, 3, "actuator_nonlinearity", cubic_per_v2=-0.01)
-    spread = fit_scatter(ready.structure, ready.data, base, DRIVE)
-    assert spread is None or spread.objection != ""
-    law = only(ready, base, "actuator_nonlinearity:cubic")
-    assert law.adequate
 
 
 def test_the_velocity_of_another_place_in_modes_of_unknown_shape(tmp_path: Path) -> None:
@@ -609,222 +520,6 @@ def test_a_claim_takes_most_of_the_misfit_away(
     assert trace.accounts(both, gross, [skew, poor, both]) is accounted
 
 
-@pytest.mark.parametrize(
-    ("key", "parameters", "place"),
-    [
-        pytest.param("nonlinear_damping/cubic", {}, "forward", marks=pytest.mark.slow),
-        ("flame_delay", {"delay_s": 3e-4}, "flame"),
-        ("nonlinearity_shape/quartic", {}, "nonlinearity"),
-        ("nonlinear_damping/quadratic", {"quadratic_per_m": 20.0}, "forward"),
-        pytest.param("actuator_dynamics/voice_coil", {}, "actuator", marks=pytest.mark.slow),
-        ("actuator_dynamics/voice_coil", {"pole_hz": 150.0}, "actuator"),
-        pytest.param("actuator_nonlinearity/clipping", {}, "actuator", marks=pytest.mark.slow),
-        pytest.param("channel_mismatch/gain", {}, "sensor", marks=pytest.mark.slow),
-        ("sensor_offset", {"offset_m": 0.056}, "sensor"),
-        ("parameter_drift/damping", {}, "experiment"),
-    ],
-)
-def test_what_no_candidate_explains_is_placed(
-    tmp_path: Path, key: str, parameters: dict[str, float], place: str
-) -> None:
-    """A freely shaped piece takes the misfit up where it lies, and nowhere else."""
-    ready = thesis_campaign(tmp_path, 7, {key: parameters or drawn_values(key)})
-    base = start.fit_from_data(ready.structure, ready.data)
-    pieces = shaped(ready.structure, ready.data, base, [], InProcess(), lambda share, text: None)
-    found = whereabouts(pieces, [], base)
-    assert found.likely == (place,), found.words
-    assert PLACES[place] in found.words
-
-
-@pytest.mark.parametrize("time", LAGS)
-def test_a_free_shape_starts_as_a_lag(time: float) -> None:
-    """As near as the series, cut off there, leaves it: no |B^j − 1| is above 2."""
-    piece = ShapedFlame(Setting(100.0, 2))
-    h = dict(zip((q.name for q in piece.parameters), lag(time), strict=True))
-    s = 2j * np.pi * np.array([90.0, 100.0, 110.0])
-    exact = 1.0 / (1.0 + s * time / piece.corner)
-    *_, before, last = lag(time)
-    ratio = abs(last / before)
-    cut = 2 * abs(last) * ratio / (1 - ratio)
-    np.testing.assert_allclose(piece.response(h, s), exact, rtol=0, atol=cut)
-
-
-@pytest.mark.parametrize("piece", [ShapedNonlinearity, ShapedForward])
-def test_a_free_shape_restated_says_the_same(tmp_path: Path, piece: type[Shaped]) -> None:
-    """Started from the richer structure's values, a piece predicts what that structure does."""
-    ready = thesis_campaign(tmp_path, 7, {})
-    data, shape = ready.data, piece(Setting(ready.data.free_hz, ready.structure.mode_count))
-    richer = shape.restated(ready.structure)
-    assert richer is not None
-    theta = next(start.candidates(richer, data))
-    larger = ready.structure.with_effects(shape)
-    same = by_name(shape, larger, richer.parameters.plain(theta))
-    one = start.coarse(richer, data, [theta], 0.01)[0].cost
-    assert start.coarse(larger, data, [same], 0.01)[0].cost == pytest.approx(one, rel=1e-6)
-
-
-@pytest.mark.slow
-def test_a_known_effect_that_does_better_than_a_free_shape_speaks_for_its_place(
-    tmp_path: Path,
-) -> None:
-    """Hysteresis follows no power of the flame's input: the smooth pieces of other places take
-    more, and what remembers takes it all."""
-    ready = thesis_campaign(tmp_path, 7, {"nonlinearity_shape": {"hysteresis_width": 0.0063}})
-    base = start.fit_from_data(ready.structure, ready.data)
-    run, silent = InProcess(), lambda share, text: None
-    some = (ShapedExperiment, ShapedActuator, ShapedNonlinearity)
-    pieces = shaped(ready.structure, ready.data, base, [], run, silent, some)
-    assert whereabouts(pieces, [], base).likely != ("nonlinearity",)
-    memory = remembering(ready.structure, ready.data, base, run, silent)
-    assert [t.adequate for t in memory] == [True]
-    assert whereabouts([*pieces, *memory], [], base).likely == ("nonlinearity",)
-    tries = trace.try_effects(
-        ready.structure, ready.data, base, [by_key("nonlinearity_shape:hysteresis")],
-        executor=run, keep=1, far=False, progress=silent,
-    )  # fmt: skip
-    found = whereabouts(pieces, tries, base)
-    assert found.likely == ("nonlinearity",), found.words
-    assert found.left["nonlinearity"] == tries[0].fit.chi2_per_dof
-
-
-@pytest.mark.parametrize(
-    ("key", "parameters", "places"),
-    [
-        # a shift of the drive in time is one of the record, and their gains act nearly alike
-        ("drive_scatter", {"gain_rms": 0.004, "phase_rms_rad": 0.004}, {"actuator", "sensor"}),
-        ("flame_gain_modulation", {"modulation_rms": 0.02, "corner_hz": 2.0}, {"flame"}),
-        pytest.param(
-            "parameter_drift/frequency_walk",
-            {"frequency_walk": 0.0005},
-            {"experiment"},
-            marks=pytest.mark.slow,
-        ),
-    ],
-)
-def test_runs_that_deviate_are_placed(
-    tmp_path: Path, key: str, parameters: dict[str, float], places: set[str]
-) -> None:
-    """No law takes up what differs from run to run; runs that each deviate there do."""
-    ready = thesis_campaign(tmp_path, 7, {key: parameters})
-    base = start.fit_from_data(ready.structure, ready.data)
-    run = InProcess()
-    some = (ShapedActuator, ShapedExperiment)
-    laws = shaped(ready.structure, ready.data, base, [], run, lambda share, text: None, some)
-    assert not any(t.adequate for t in laws)
-    deviations = deviating(ready.structure, ready.data, base, run)
-    found = whereabouts([*laws, *deviations], [], base)
-    assert set(found.likely) == places, found.words
-    assert found.from_run_to_run
-    assert "differs from run to run and " in found.words
-    assert all(found.left[p] < 1.5 < min(t.fit.chi2_per_dof for t in laws) for p in places)
-    assert found.to_json()["from_run_to_run"] is True
-
-
-def test_a_law_that_explains_needs_no_run_to_deviate(tmp_path: Path) -> None:
-    """Whatever a spread takes up: a place where a law says it all is where it lies."""
-    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-5}})
-    base = start.fit_from_data(ready.structure, ready.data)
-    run = InProcess()
-    deviations = deviating(ready.structure, ready.data, base, run)
-    law = trace.try_effects(
-        ready.structure, ready.data, base, [by_key("flame_delay")], executor=run, keep=1,
-        far=False, progress=lambda share, text: None,
-    )  # fmt: skip
-    found = whereabouts(deviations, law, base)
-    assert (found.likely, found.from_run_to_run) == (("flame",), False)
-
-
-def test_a_place_that_takes_up_little_is_ruled_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The best leaves 28 % of 16.9 − 1, and three times as much is nearly all of it."""
-    monkeypatch.setattr(trace.Tried, "plausible", True)
-    left = {
-        "parameter_drift:frequency": 5.5,
-        "nonlinearity_shape:quintic": 9.0,
-        "flame_delay": 15.0,
-    }
-    tries = [replace(tried_as(fitted(11, chi2), key), fit_p=0.0) for key, chi2 in left.items()]
-    where = whereabouts([], tries, fitted(10, 16.9))
-    assert where.likely == ("experiment", "nonlinearity")
-    assert list(where.left) == ["experiment", "nonlinearity", "flame"]
-
-
-def test_a_place_that_could_not_be_shaped_is_not_ruled_out() -> None:
-    """Unless another explains it all."""
-    shape = replace(tried_as(fitted(11, 9.0), "channel_mismatch:skew"), fit_p=0.0)
-    where = whereabouts([shape], [], fitted(10, 500.0))
-    others = ("forward", "flame", "nonlinearity", "actuator", "experiment")
-    assert (where.likely, list(where.left)) == (("sensor", *others), ["sensor"])
-    assert "no fit: forward, flame, nonlinearity, actuator, experiment" in where.words
-    explains = tried_as(fitted(11, 1.0), "channel_mismatch:skew")
-    assert whereabouts([explains], [], fitted(10, 500.0)).likely == ("sensor",)
-
-
-def test_effects_of_two_places_that_leave_far_less_than_any_one(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Each place's shape only comes near to what is not in it alone."""
-    monkeypatch.setattr(trace.Tried, "plausible", True)
-    one = replace(tried_as(fitted(11, 60.0), "channel_mismatch:skew"), fit_p=0.0)
-    both = tried_as(fitted(12, 3.0), "acoustic_mode:mode", "parameter_drift:frequency")
-    three = tried_as(fitted(13, 2.6), "acoustic_mode:mode", "flame_delay", "channel_mismatch:skew")
-    found = whereabouts([one], [both, three], fitted(10, 500.0))
-    assert (found.likely, found.together) == (("forward", "experiment"), 3.0)
-    assert "the forward path and the course of the experiment together" in found.words
-    assert found.to_json()["together"] == 3.0
-    # what leaves little less does so for having more numbers
-    near = replace(one, fit=fitted(11, 20.0))
-    assert whereabouts([near], [both], fitted(10, 500.0)).together is None
-    # what leaves much itself rules no place out
-    lost = replace(one, fit=fitted(11, 900.0))
-    less = tried_as(fitted(12, 30.0), "acoustic_mode:mode", "parameter_drift:frequency")
-    found = whereabouts([], [lost, less], fitted(10, 7000.0))
-    assert (found.likely, found.together) == (("sensor", "forward", "experiment"), None)
-
-
-@pytest.mark.slow
-def test_unexplained_says_where(tmp_path: Path) -> None:
-    """Without the candidate that it is, a flame delay ends as unexplained, on the flame's side."""
-    ready = thesis_campaign(tmp_path, 7, {"flame_delay": {"delay_s": 3e-4}})
-    found = identify.diagnose(ready.campaign, catalogue=[by_key("channel_mismatch:gain")])
-    assert found.verdict == "unexplained"
-    assert found.whereabouts is not None
-    assert found.whereabouts.likely == ("flame",)
-    assert found.to_json()["whereabouts"]["likely"] == ["flame"]
-    assert "lies in the flame path" in found.explanation
-    assert "places" in [path.stem for path in save_figures(tmp_path / "figures", found)]
-
-
-def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
-    """A spread beside an effect is not claimed where a law explains the data with less."""
-    ready = thesis_campaign(tmp_path, 8, {"flame_delay": {"delay_s": 3e-4}})
-    base = start.fit_from_data(ready.structure, ready.data)
-    law = trace.try_effects(
-        ready.structure, ready.data, base, [by_key("flame_delay")], executor=InProcess(), keep=1,
-        far=False, progress=lambda share, text: None,
-    )[0]  # fmt: skip
-    beside = try_scatters(law.fit.structure, ready.data, law.fit, [FLAME], InProcess())[0]
-    kept = against_chance([beside])[0]
-    assert (kept.plausible, against_chance([law, beside])[1].plausible) == (True, False)
-    # as likely as another spread it is a rival, where its law predicts the held-out runs
-    other = replace(beside, effects=(DRIVE,))
-    assert trace.rivals(other, [beside]) == [beside]
-    assert trace.rivals(other, [replace(beside, validation_p=1e-17)]) == []
-
-
-@pytest.mark.slow
-def test_a_gross_misfit_of_one_place_is_sought_nowhere_else(tmp_path: Path) -> None:
-    """A voice coil that no candidate names: the actuator's free shape explains it, and no other."""
-    ready = thesis_campaign(tmp_path, 7, {"actuator_dynamics/voice_coil": {"pole_hz": 150.0}})
-    others = [
-        by_key(k) for k in ("channel_mismatch:gain", "sensor_dynamics:lowpass", "flame_delay")
-    ]
-    found = identify.diagnose(ready.campaign, catalogue=others)
-    assert found.verdict == "unexplained"
-    assert found.whereabouts is not None
-    assert found.whereabouts.likely == ("actuator",)
-    assert {len(c.effects) for c in found.candidates} == {1}
-
-
 def test_fitted_and_held_out_runs_speak_together(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fitted and held-out runs that noise alone hardly leaves, each for itself, refuse what both
     were to be explained by; and what predicts them better is a rival, if of more parameters."""
@@ -862,26 +557,6 @@ def test_a_form_that_extends_the_best_hides_no_rival(monkeypatch: pytest.MonkeyP
     assert trace.rivals(delay, [delay, distributed, resonance]) == [resonance]
 
 
-@pytest.mark.slow
-def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A cubic loss that no candidate names: one more mode leaves χ²/dof 1.57 at 69 degrees of
-    freedom, which chance leaves once in four hundred times. Its damping is stopped at the edge of
-    the plausible; were that wider, a free shape would still speak against it."""
-    monkeypatch.setattr("identify.parameters.EDGE", 0.0)
-    loss = {"nonlinear_damping": {"cubic_s_per_m2": 0.7536}}
-    recordings = thesis_campaign(tmp_path, 1050, loss, validation=3).campaign
-    mode = [by_key("acoustic_mode:mode")]
-    found = identify.diagnose(recordings, catalogue=mode)
-    assert (found.verdict, found.effects) == ("unexplained", ())
-    assert "far less likely than a law" in found.explanation
-    assert found.whereabouts is not None
-    assert "forward" in found.whereabouts.likely
-    monkeypatch.setattr(verdict, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
-    assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
-
-
 def test_two_drifts_at_once_are_one_effect_with_two_changes(tmp_path: Path) -> None:
     both = [
         ("parameter_drift", {"damping_change": -0.045}),
@@ -895,31 +570,6 @@ def test_two_drifts_at_once_are_one_effect_with_two_changes(tmp_path: Path) -> N
     for what, truth in (("damping", -0.045), ("flame_gain", 0.013), ("speaker_gain", 0.0)):
         found = best.estimates[f"parameter_drift.{what}_change"]
         assert abs(found.value - truth * over) < 4 * found.stderr
-
-
-@pytest.mark.slow
-def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> None:
-    """The drift of the speaker's gain is not the best of the effects alone, nor the modulation
-    enough: it stands out where the modulation has been accounted for."""
-    ready = thesis_campaign(
-        tmp_path,
-        13,
-        {
-            "parameter_drift": {"speaker_gain_change": 0.0015},
-            "flame_gain_modulation": {"modulation_rms": 0.01, "corner_hz": 0.4},
-        },
-    )
-    base = start.fit_from_data(ready.structure, ready.data)
-    forms = ("parameter_drift:speaker_gain", "parameter_drift:flame_gain_curve")
-    laws = [*forms, "nonlinear_damping:quadratic", "flame_delay"]
-    catalogue = [*(by_key(k) for k in laws), *SCATTERS]
-    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
-    best = trace.best_form([t for t in found if t.explains])
-    assert best.key == ("flame_gain_modulation", "parameter_drift")
-    assert best.effects[0].form == "speaker_gain"
-    change = best.estimates["parameter_drift.relative_change"]
-    over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
-    assert abs(change.value - 0.0015 * over) < 4 * change.stderr
 
 
 def test_a_lesser_effect_beside_one_that_leaves_hardly_more_than_noise(tmp_path: Path) -> None:
@@ -942,175 +592,6 @@ def test_a_lesser_effect_beside_one_that_leaves_hardly_more_than_noise(tmp_path:
     assert abs(a2.value + 0.0014) < 4 * a2.stderr
 
 
-@pytest.mark.slow
-def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
-    """Each leads the other astray, but where more noise hides the scatter the distortion is seen:
-    eight per mille of the drive, and three, at 80 dB."""
-    effects = [
-        make_effect("actuator_nonlinearity/distortion", {"quadratic_per_v": -0.008}),
-        make_effect("drive_scatter", {"gain_rms": 0.0026, "phase_rms_rad": 0.0026}),
-    ]
-    rig = random_rig(6013, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
-    ready = record(tmp_path, 6013, rig, effects, forced=9, validation=3, modes=1)
-    base = start.fit_from_data(ready.structure, ready.data)
-    assert base.chi2_per_dof > 1e4
-    laws = ("quadratic", "cubic_quintic")
-    catalogue = [by_key(f"actuator_nonlinearity:{form}") for form in laws]
-    catalogue += [by_key("acoustic_mode:mode"), *SCATTERS]
-    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
-    declared = tried((), base, ready.data)
-    good = [t for t in found if t.explains and trace.accounts(t, declared, found)]
-    best = trace.best_form(good)
-    assert best.key_of_forms == ("actuator_nonlinearity:quadratic", "drive_scatter")
-    assert trace.rivals(best, found) == []
-    a2 = best.estimates["actuator_nonlinearity.a2"]
-    assert abs(a2.value + 0.008) < 4 * a2.stderr
-    assert a2.stderr < 1e-4
-
-
-@pytest.mark.slow
-def test_a_law_and_chance_may_go_by_the_same_name(tmp_path: Path) -> None:
-    """The speaker warms while all frequencies wander: two kinds of drift."""
-    both = [
-        ("parameter_drift", {"speaker_gain_change": 0.02}),
-        ("parameter_drift", {"frequency_walk": 0.002}),
-    ]
-    ready = thesis_campaign(tmp_path, 7, both, noise_db=50.0)
-    base = start.fit_from_data(ready.structure, ready.data)
-    forms = ("speaker_gain", "flame_gain", "damping")
-    laws = [*(f"parameter_drift:{form}" for form in forms), "flame_delay"]
-    catalogue = [*(by_key(k) for k in laws), *SCATTERS]
-    found = trace.search(ready.structure, ready.data, base, catalogue=catalogue).tried
-    declared = tried((), base, ready.data)
-    good = [t for t in found if t.explains and trace.accounts(t, declared, found)]
-    best = trace.best_form(good)
-    assert best.words == "parameter_drift:speaker_gain + parameter_drift:random"
-    assert best.names == ("parameter_drift", "parameter_drift")
-    assert trace.rivals(best, found) == []
-    assert trace.other_forms(best, good) == {"parameter_drift": ()}
-    change = best.estimates["parameter_drift.relative_change"]
-    over = (len(ready.campaign.runs) - 1) / 10  # of the 1200 s that the rig's change takes
-    assert abs(change.value - 0.02 * over) < 4 * change.stderr
-
-
-@pytest.mark.parametrize(
-    ("runs", "error", "left", "beaten"),
-    [(3, 1e-3, 6.0, True), (3, 1e-2, 6.0, False), (1, 1e-3, 6.0, False), (3, 1e-3, 400.0, False)],
-)
-def test_runs_that_a_law_foretells_do_not_scatter(
-    runs: int, error: float, left: float, beaten: bool
-) -> None:
-    """Three held-out runs within a thirtieth of what the drive's phase would scatter by: no chance,
-    though the law leaves a misfit elsewhere (42077, a loss in the place of which a scatter beside
-    a wrong form of the microphones' mismatch was claimed). One run may be so by chance, and so may
-    three by one of many laws that miss the fitted ones by far (43096, a natural frequency that
-    wanders)."""
-    spread = Spread(fitted(2, 1.0), of_runs(runs), {}, 0.0, "")
-    effects = (by_key("channel_mismatch:skew"), DRIVE)
-    chance = trace.Tried(effects, fitted(2, 1.0), 0.033, 0.5, 0.5, spread, (2.0 * runs, 2 * runs))
-    law = replace(tried_as(fitted(3, left), "acoustic_mode:mode"), validation_error=error)
-    (judged,) = against_chance([chance], [replace(law, held_out=(40.0, 2 * runs), fit_p=0.0)])
-    assert (judged.objection != "") is beaten
-
-
-def test_another_chance_is_tried_beside_a_law_though_one_explains_by_itself(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Frequencies that wander beside a damping that falls passed for a scatter of the drive, which
-    may be anything at the fundamental (41069)."""
-    spread = Spread(fitted(0, 1.0), None, {}, 0.0, "")  # type: ignore[arg-type]
-    alone = trace.Tried((DRIVE,), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
-    law = tried_as(fitted(1, 400.0), "parameter_drift:damping")
-    asked: list[str] = []
-
-    def scattered(*arguments: Any) -> list[trace.Tried]:
-        asked.extend(s.key for s in arguments[3])
-        return []
-
-    monkeypatch.setattr(chance_steps, "try_scatters", scattered)
-    for seek in ("beside_chance", "other_forms_beside_chance", "in_the_place_of_chance"):
-        monkeypatch.setattr(chance_steps, seek, lambda *rest: [])
-    going = searching(fitted(0, 500.0), scatters=SCATTERS)
-    going.tried = [alone, law]
-    monkeypatch.setattr(trace.Tried, "plausible", True)
-    chance_steps.try_chance(going, [law])
-    assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
-    # and beside a law that comes to light within it alone (46105)
-    asked.clear()
-    within = trace.Tried((*law.effects, DRIVE), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
-    monkeypatch.setattr(chance_steps, "beside_chance", lambda *rest: [within])
-    for simpler in ("simpler_beside_chance", "without_chance", "without_law"):
-        monkeypatch.setattr(chance_steps, simpler, lambda *rest: [])
-    chance_steps.try_chance(going, [])
-    assert set(asked) == {s.key for s in SCATTERS} - {"drive_scatter"}
-
-
-def test_a_law_beside_chance_is_claimed_only_after_the_other_kinds(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Frequencies that wander beside a voice coil were claimed as a drive that scatters: the other
-    kinds, started from the law alone, had gone astray (54158)."""
-    spread = Spread(fitted(0, 1.0), None, {}, 0.0, "")  # type: ignore[arg-type]
-    coil = tried_as(fitted(1, 1.0), "actuator_dynamics:pole")
-    best = trace.Tried((*coil.effects, DRIVE), fitted(0, 1.0), 1e-3, 0.5, 0.5, spread)
-    asked: list[Any] = []
-
-    def scattered(*arguments: Any) -> list[trace.Tried]:
-        asked.append(arguments)
-        return []
-
-    monkeypatch.setattr(chance_steps, "try_scatters", scattered)
-    monkeypatch.setattr(trace.Tried, "plausible", True)
-    going = searching(fitted(0, 500.0), scatters=SCATTERS)
-    going.tried = [coil]
-    assert chance_steps.within_other_chance(going) == []
-    assert asked == []
-    going.tried = [best]
-    chance_steps.within_other_chance(going)
-    ((_, _, base, kinds, *_),) = asked
-    assert base is best.fit  # from where they ended together
-    assert {s.key for s in kinds} == {s.key for s in SCATTERS} - {"drive_scatter"}
-
-
-def test_chance_is_tried_beside_what_may_be_true(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A delay of the flame while frequencies wander left more than what an overdamped mode followed
-    (54019)."""
-    offset = tried_as(fitted(1, 2e4), "sensor_offset:propagation")
-    delay = tried_as(fitted(1, 8e4), "flame_delay")
-    pole = tried_as(fitted(1, 9e4), "flame_dynamics:pole")
-    shape = tried_as(fitted(1, 9.5e4), "nonlinearity_shape:quartic")
-    asked: list[Fit] = []
-    monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: t.names != offset.names))
-    going = searching(fitted(0, 2e5), scatters=SCATTERS)
-    monkeypatch.setattr(
-        chance_steps, "scattered", lambda going, _, base, kinds: asked.append(base) or []
-    )
-    going.tried = [offset, delay, pole, shape]
-    chance_steps.likely_beside_chance(going, [offset])
-    assert [f.chi2 for f in asked] == [delay.fit.chi2, pole.fit.chi2]
-    asked.clear()
-    chance_steps.likely_beside_chance(going, [delay])
-    assert [f.chi2 for f in asked] == [pole.fit.chi2, shape.fit.chi2]
-
-
-@pytest.mark.parametrize(("runs", "accounted"), [(9, False), (60, True)])
-def test_a_law_beside_few_runs_that_scatter_must_gain_more(runs: int, accounted: bool) -> None:
-    """A mode of four numbers gained 30.6 of χ² and penalty on a scatter of nine runs, by following
-    it (45153). The same gain on sixty runs is none that chance brings about."""
-    two = {"drive_scatter.gain_rms": None, "drive_scatter.phase_rms_rad": None}
-    beside = Spread(fitted(15, 1.0), of_runs(runs), two, 200.0, "")  # type: ignore[arg-type]
-    before = fitted(11, 1.0)
-    wider = replace(beside, penalty=200.0 + 30.6 - before.chi2 + fitted(15, 1.0).chi2)
-    alone = trace.Tried((DRIVE,), before, 1e-3, 0.5, 0.5, wider)
-    mode = trace.Tried(
-        (by_key("acoustic_mode:mode"), DRIVE), fitted(15, 1.0), 1e-3, 0.5, 0.5, beside
-    )
-    declared = tried_as(fitted(11, 3e4))
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(trace.Tried, "plausible", True)
-        assert trace.accounts(mode, declared, [alone, mode]) is accounted
-
-
 def test_the_plainest_law_is_grown_from_too() -> None:
     """A delay of the speaker and a drift lay behind a nonlinear loss of three numbers, which left
     less than the delay alone (45205)."""
@@ -1125,130 +606,3 @@ def test_the_plainest_law_is_grown_from_too() -> None:
         assert plainest_of(going, [loss, skew]) == []  # leaves too much
         going.extended[delay.key_of_forms] = delay.fit.chi2
         assert plainest_of(going, [loss, delay, skew]) == []
-
-
-def test_chance_is_tried_without_the_law_that_led_to_it(tmp_path: Path) -> None:
-    """From a declared fit that chance has led astray, chance alone may lead nowhere."""
-    scatter = {"gain_rms": 0.005, "phase_rms_rad": 0.005}
-    ready = thesis_campaign(tmp_path, 7, {"drive_scatter": scatter}, noise_db=80.0)
-    base = start.fit_from_data(ready.structure, ready.data)
-    lag = by_key("actuator_dynamics:pole")
-    larger = ready.structure.with_effects(lag)
-    begun = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0], iterations=5)
-    both = try_scatters(larger, ready.data, begun, [DRIVE], InProcess())
-    assert both[0].adequate
-    (alone,) = without_law(both, (), ready.data, InProcess())
-    assert alone.explains
-    assert alone.key_of_forms == ("drive_scatter",)
-    declared, found = tried((), base, ready.data), [*both, alone]
-    assert [trace.accounts(t, declared, found) for t in found] == [False, True]
-    assert without_law(both, {("drive_scatter",)}, ready.data, InProcess()) == []
-
-
-@pytest.mark.slow
-def test_a_law_beside_chance_in_other_forms(tmp_path: Path) -> None:
-    """The drive's cubic term taken for a quadratic one leaves what no scatter of the drive is."""
-    effects = {
-        "actuator_nonlinearity/compression": {"cubic_per_v2": 0.02},
-        "drive_scatter": {"gain_rms": 0.003, "phase_rms_rad": 0.003},
-    }
-    ready = thesis_campaign(tmp_path, 7, effects, noise_db=60.0)
-    base = start.fit_from_data(ready.structure, ready.data)
-    wrong, right = (by_key(f"actuator_nonlinearity:{form}") for form in ("quadratic", "cubic"))
-    larger = ready.structure.with_effects(wrong)
-    begun = fit_orbits(larger, ready.data, np.r_[base.theta, 0.0])
-    both = try_scatters(larger, ready.data, begun, [DRIVE], InProcess())
-    assert not both[0].explains
-    found = other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
-    best = trace.best_form([t for t in found if t.explains])
-    assert best.key_of_forms == ("actuator_nonlinearity:cubic", "drive_scatter")
-    a3 = best.estimates["actuator_nonlinearity.a3"]
-    assert abs(a3.value + 0.02) < 4 * a3.stderr
-
-
-@pytest.mark.slow
-def test_other_forms_are_asked_beside_each_kind_of_chance(tmp_path: Path) -> None:
-    """The drive's scatter takes up whatever the drive does: beside it, the wrong form may leave
-    less than beside the frequency's walk, which is the truth."""
-    effects = {
-        "actuator_dynamics/resonance": {"resonance_hz": 800.0, "damping": 0.3},
-        "parameter_drift/frequency_walk": {"frequency_walk": 1e-3},
-    }
-    ready = thesis_campaign(tmp_path, 7, effects, noise_db=60.0)
-    base = start.fit_from_data(ready.structure, ready.data)
-    wrong, right = (by_key(f"actuator_dynamics:{form}") for form in ("pole", "resonance"))
-    lag = only(ready, base, "actuator_dynamics:pole")
-    scattered, walking = try_scatters(
-        lag.fit.structure, ready.data, lag.fit, [DRIVE, WALK], InProcess()
-    )
-    assert walking.spread is not None
-    less = replace(scattered.fit, chi2=0.5 * walking.fit.chi2)
-    refused = replace(walking.spread, objection="frequency_rms follows the frequency")
-    both = [replace(scattered, fit=less), replace(walking, spread=refused)]
-    found = other_forms_beside_chance(both, ready.data, [wrong, right], InProcess())
-    best = trace.best_form([t for t in found if t.explains])
-    assert best.key_of_forms == ("actuator_dynamics:resonance", "parameter_drift:random")
-
-
-@pytest.mark.parametrize(
-    ("gain", "error", "claimed"), [(5.0, 1e-3, False), (15.0, 1e-3, True), (15.0, 5e-3, False)]
-)
-def test_a_law_beside_a_spread_must_gain_on_the_spread_alone(
-    gain: float, error: float, claimed: bool
-) -> None:
-    """And predict the held-out runs not many times worse than the declared model, at 1e-3."""
-    law, far = tried_as(fitted(2, 40.0), "flame_delay"), tried_as(fitted(0, 80.0))
-    sizes = {"flame_gain_modulation.modulation_rms": Estimate(0.01, 0.002, "1")}
-    alone = trace.Tried(
-        (FLAME,),
-        fitted(0, 1.0),
-        1e-3,
-        0.5,
-        0.5,
-        Spread(fitted(0, 1.0), of_runs(100), sizes, 100.0, "?"),
-    )
-    beside = fitted(2, 1.0)
-    penalty = alone.evidence - gain - (beside.chi2 + 3 * float(np.log(beside.residual.size)))
-    spread = Spread(beside, of_runs(100), sizes, penalty, "")
-    both = trace.Tried((*law.effects, FLAME), beside, error, 0.5, 0.5, spread)
-    assert trace.accounts(both, far, [law, alone, both]) is claimed
-
-
-@pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])
-def test_between_spreads_the_likelihood_decides(
-    tmp_path: Path, penalty: float, rival: bool
-) -> None:
-    """One that leaves a lack of fit, far likelier than one that leaves none, remains a rival."""
-    wander = {"modulation_rms": 0.01, "corner_hz": 2.0}
-    ready = thesis_campaign(tmp_path, 7, {"flame_gain_modulation": wander})
-    base = start.fit_from_data(ready.structure, ready.data)
-    flame, drive = try_scatters(ready.structure, ready.data, base, [FLAME, DRIVE], InProcess())
-    assert flame.spread is not None
-    assert drive.spread is not None
-    best = replace(drive, spread=replace(drive.spread, penalty=300.0, objection=""), fit_p=0.5)
-    chi2 = drive.fit.chi2 + 100.0
-    lacking = replace(
-        flame,
-        fit=replace(flame.fit, chi2=chi2),
-        fit_p=1e-5,
-        spread=replace(flame.spread, penalty=penalty, objection=""),
-    )
-    assert not lacking.explains
-    assert (trace.rivals(best, [best, lacking]) == [lacking]) is rival
-
-
-def test_a_law_beside_a_spread_leaves_what_noise_usually_does() -> None:
-    """It is the best of many, beside what takes up much: that it is hardly noise speaks against it.
-    A spread alone, or a law alone, may leave so little."""
-    size = Estimate(1e-3, 1e-4, "1")
-    chance = trace.Tried((DRIVE,), fitted(11, 1.0), 1e-3, 0.05, 0.5)
-    spread = Spread(chance.fit, None, {DRIVE.parameters[0].name: size}, 10.0, "")  # type: ignore[arg-type]
-    alone = replace(chance, spread=spread)
-    beside = replace(alone, effects=(by_key("flame_delay"), DRIVE))
-    assert alone.leaves_noise
-    assert not beside.leaves_noise
-    assert replace(beside, fit_p=0.2).leaves_noise
-    # nor what is held out: a law led to where chance is large enough for it (67029)
-    assert not replace(beside, fit_p=0.2, validation_p=0.005).leaves_noise
-    assert replace(beside, fit_p=0.2, validation_p=float("nan")).leaves_noise  # nothing held out
-    assert replace(beside, effects=(by_key("flame_delay"),), spread=None).leaves_noise
