@@ -1,4 +1,13 @@
-"""A rig in software that stands behind the drivers' protocols."""
+"""A rig in software that stands behind the drivers' protocols. What is where:
+
+the physics     `plant`, `tube`, `actuator`, `sensors`, `drift`, `operating`, `controllers`,
+                `config`
+what it lacks   `effects`, `seal` (drawn and kept from everybody), `presets`, `random_rigs`
+in time         `statespace`, `etd`, `kernel`, `kernel_plain`, `simulation`, `fleet`, `cycle`
+steady states   `orbits`, `continuation`, `stability`, `threads`
+as a device     `rig`, `build`, `clocks`, `campaigns` (whole ones at once), `hil` (in real time,
+                behind real ports)
+"""
 
 from simulated_rig.build import build_config, build_rig, noise_pa
 from simulated_rig.campaigns import PlannedRun, plan_campaign, simulate_campaign, write_campaign
