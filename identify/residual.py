@@ -26,6 +26,8 @@ ComplexArray = npt.NDArray[np.complex128]
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+LARGEST = 1e100  # of a residual in units of noise, or its slope: the square of more may overflow
+
 
 def soften(batches: Sequence[Batch], share: float) -> tuple[Batch, ...]:
     """Batches whose noise is raised by `share` of each coefficient's size."""
@@ -49,6 +51,7 @@ def soften(batches: Sequence[Batch], share: float) -> tuple[Batch, ...]:
 class OrbitResidual:
     """Whitened residuals of solved orbits, with the last orbits to start the next ones from.
 
+    A residual does not exist where an orbit does not, or where it is beyond numbers.
     With `newton_steps` the orbits are only approached by that many steps from the measurement:
     the residual then exists for nearly every θ and has fewer local minima, close to a solution it
     is the same. (The plain equation error with the measured velocity fed to the nonlinearity has
@@ -80,12 +83,12 @@ class OrbitResidual:
         if self.newton_steps is None:
             exists &= orbits.converged.reshape(vectors, -1).all(axis=1)
         residual = np.concatenate(rows, axis=1)
-        exists &= np.isfinite(residual).all(axis=1)
+        exists &= (np.abs(residual) < LARGEST).all(axis=1)
         if not jacobian:
             self.solved = thetas.copy(), orbits
             return Evaluated(residual, None, exists)
         J_all = np.concatenate(jacobians, axis=1)
-        exists &= np.isfinite(J_all).all(axis=(1, 2))
+        exists &= (np.abs(J_all) < LARGEST).all(axis=(1, 2))
         if self.newton_steps is None:
             for n, descent in enumerate(which):
                 if exists[n]:

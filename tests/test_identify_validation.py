@@ -147,3 +147,17 @@ def test_a_run_without_a_steady_state_is_infinitely_far_and_warns_of_nothing() -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert np.isinf(np.abs(unsolved.normalised)).all()
+
+
+@pytest.mark.parametrize(("times", "exists"), [(1e60, True), (1e160, False)])
+def test_a_misfit_beyond_numbers_is_none(times: float, exists: bool) -> None:
+    """Its square overflowed, with a warning (a speaker's high-pass beside a step, 9115)."""
+    data = clean(WIDE, 3e-4)
+    away = theta(STRUCTURE) * 1.001
+    batches = tuple(replace(b, whitener=b.whitener * times) for b in data.fit)
+    residual = OrbitResidual(STRUCTURE, batches, newton_steps=2)
+    assert residual(away[None, :], np.arange(1), True).exists.all() == exists
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (descent,) = levenberg_marquardt(residual, away[None, :], iterations=3)
+    assert (descent is not None) == exists
