@@ -92,7 +92,8 @@ def diagnose(
     fit = start.fit_declared(recorded.structure, recorded.data)
     found = _searched(recorded, fit, catalogue, run, report, began + within_s)
     end = _Concluding(found, run, report, within_s).conclusion()
-    declared, data, chosen, tones = found.declared, found.ready.data, end.chosen, found.tones
+    declared, data, chosen = found.declared, found.ready.data, end.chosen
+    tones = _tone_effects(found.ready.quality.tones)
     before = declared.assessment
     verdict, explanation = end.verdict, end.explanation
     if tones and verdict in ("no_discrepancy", "traced"):
@@ -132,18 +133,13 @@ def diagnose(
 @dataclass(frozen=True)
 class _Searched:
     """What the search has come to: the data as they are known in the end, the declared model there,
-    all that was tried, and freely shaped pieces with the data and the declared fit they belong to.
-    """
+    all that was tried, and freely shaped pieces where some were fitted that still serve."""
 
     ready: Prepared
     declared: Declared
     tried: tuple[Tried, ...] = ()
-    pieces: tuple[Dataset, Fit, Sequence[Tried]] | None = None
+    pieces: tuple[Tried, ...] = ()
     whole: bool = True  # False: ended by its time limit before all had been tried
-
-    @property
-    def tones(self) -> tuple[TracedEffect, ...]:
-        return _tone_effects(self.ready.quality.tones)
 
 
 def _searched(
@@ -159,7 +155,7 @@ def _searched(
     data, fit = drive.refitted(fit, recorded.data)
     ready = replace(recorded, data=data)
     catalogue = data.among(catalogue)
-    declared = declared_model(fit, ready, catalogue, run)
+    declared = _declared_model(fit, ready, catalogue, run)
     if not declared.significant:
         return _Searched(ready, declared)
     found = trace.search(
@@ -172,7 +168,7 @@ def _searched(
         scores=declared.scores or None,
         until=until,
     )
-    tried, pieces = found.tried, (data, declared.fit, found.pieces)
+    tried, pieces = found.tried, found.pieces
     known = [t for t in tried if t.plausible and t.fit.converged]
     if known and not any(t.adequate for t in tried):
         # the best of them knows better than the declared fit how the drive's errors show
@@ -180,18 +176,20 @@ def _searched(
         better, fit = drive.refitted(declared.fit, recorded.data, best.fit)
         if better is not recorded.data:
             ready = replace(ready, data=better)
-            declared = declared_model(fit, ready, catalogue, run)
+            declared = _declared_model(fit, ready, catalogue, run)
             laws = [t for t in best_by_name(tried) if t.spread is None]
             tried = tuple(trace.refitted(laws[:REFITTED], better))
-            pieces = better, declared.fit, tuple(trace.refitted(found.pieces, better))
+            pieces = tuple(trace.refitted(found.pieces, better))
     # what an effect explains, a better start of the declared model may explain without it
     once_more = trace.without_effects(ready.structure, ready.data, tried)
     if once_more is not None and _better(once_more, declared.fit):
-        declared = declared_model(once_more, ready, catalogue, run)
+        declared = _declared_model(once_more, ready, catalogue, run)
+        if not any(t.adequate for t in pieces):  # from the better fit they may come nearer
+            pieces = ()
     return _Searched(ready, declared, tried if declared.significant else (), pieces, found.whole)
 
 
-def declared_model(
+def _declared_model(
     fit: Fit, ready: Prepared, catalogue: Sequence[Effect], executor: Executor
 ) -> Declared:
     """The declared model as it is fitted, and whether it leaves more than noise."""
@@ -285,12 +283,7 @@ class _Concluding:
     def pieces(self) -> list[Tried]:
         """Freely shaped pieces at each place of the loop, those of the search where they serve."""
         found = self.found
-        if found.pieces is not None:
-            data, base, shapes = found.pieces
-            fitting = (base is self.base and shapes) or any(t.adequate for t in shapes)
-            if data is self.data and fitting:
-                return list(shapes)
-        return trace.shaped(
+        return list(found.pieces) or trace.shaped(
             found.ready.structure, self.data, self.base, found.tried, self.run, self.placing
         )
 

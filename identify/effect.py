@@ -321,15 +321,11 @@ def driven(effects: Sequence[Effect], p: Values, at: Conditions, drive: Any) -> 
     curves = [e for e in effects if type(e).amplifier is not Effect.amplifier]
     if curves and np.any(dual.value(drive)):
         samples = None if len(curves) == 1 and curves[0].smooth else FINE
-        in_turn = [partial(e.amplifier, p) for e in sorted(curves, key=_rails)]
+        in_turn = [partial(e.amplifier, p) for e in sorted(curves, key=lambda e: e.rails)]
         drive = _bent(in_turn, drive, samples)
     for e in effects:
         drive = e.drive(p, at, drive)
     return drive
-
-
-def _rails(effect: Effect) -> bool:
-    return effect.rails
 
 
 def _bent(curves: Sequence[Callable[[FloatArray], Bent]], drive: Any, samples: int | None) -> Any:

@@ -119,7 +119,7 @@ def _denser(structure: Structure, rough: Dataset, near: Fit, free_hz: float) -> 
     such a fit says of the singing mode, flame and nonlinearity is good all the same.
     """
     dense = dense_placements(structure.mode_count - 1)
-    thetas = signed(structure, slow_flow_vectors(structure, rough, (), dense))
+    thetas = signed(structure, slow_flow_vectors(structure, rough, ((),), dense))
     for placement in dense:
         thetas += moved(structure, near, free_hz, placement)
     starts = best_of_each(structure, coarse(structure, rough, thetas))

@@ -35,10 +35,7 @@ def physical_starts(
     Mode 1 sings. Each row of `effect_values` is assumed for the parameters of the structure's
     effects, in order. The misfit is that of approximate orbits at ten per cent noise.
     """
-    thetas: list[FloatArray] = []
-    for row in effect_values:
-        thetas += slow_flow_vectors(structure, data, row, placements)
-    return coarse(structure, data, thetas)
+    return coarse(structure, data, slow_flow_vectors(structure, data, effect_values, placements))
 
 
 def signed_starts(
@@ -52,9 +49,7 @@ def signed_starts(
 
     A residue does not come through zero on its way down a misfit that it is not alone to blame for.
     """
-    thetas = []
-    for row in effect_values:
-        thetas += signed(structure, slow_flow_vectors(structure, data, row, placements))
+    thetas = signed(structure, slow_flow_vectors(structure, data, effect_values, placements))
     return best_of_each(structure, coarse(structure, data.coarse(SCREENED), thetas))
 
 

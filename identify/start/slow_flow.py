@@ -98,10 +98,20 @@ def slow_flow(data: Dataset, effects: Sequence[Effect] = (), p: Values | None = 
 def slow_flow_vectors(
     structure: Structure,
     data: Dataset,
+    effect_values: Sequence[Sequence[float]],
+    placements: Sequence[tuple[float, ...]] | None,
+) -> list[FloatArray]:
+    """For each row of assumed values of the effects, dampings of the singing mode and places of the
+    others."""
+    return [v for row in effect_values for v in _vectors(structure, data, row, placements)]
+
+
+def _vectors(
+    structure: Structure,
+    data: Dataset,
     effect_values: Sequence[float],
     placements: Sequence[tuple[float, ...]] | None,
 ) -> list[FloatArray]:
-    """For assumed values of the effects, dampings of the singing mode and places of the others."""
     names = [q.name for e in structure.effects for q in e.parameters]
     p = dict(zip(names, effect_values, strict=True))
     flow = slow_flow(data, structure.effects, {**p, "flame.pole_hz": data.free_hz})

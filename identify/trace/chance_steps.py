@@ -25,7 +25,7 @@ from identify.trace.beside_chance import (
     without_chance,
     without_law,
 )
-from identify.trace.claims import NO_CHANCE, against_chance
+from identify.trace.claims import NO_CHANCE
 from identify.trace.exchange import in_each_form
 from identify.trace.spreads import try_scatters
 from identify.trace.stages import try_effects
@@ -174,8 +174,7 @@ def within_other_chance(going: UnderWay) -> list[Tried]:
     """The same for the law that explains the data with a spread beside it: other kinds, tried
     from where the law alone had been led to, may have gone astray (54158, frequencies that
     wander beside a voice coil, claimed as a drive that scatters)."""
-    good = [t for t in against_chance(going.tried) if t.explains]
-    best = best_form(good) if good else None
+    best = going.best
     if best is None or best.spread is None or len(best.effects) != 2:
         return []
     return _by_other_chance(going, best)

@@ -147,15 +147,15 @@ def try_foreseen(going: UnderWay) -> None:
 def try_more_modes(going: UnderWay, level: Sequence[Tried]) -> list[Tried]:
     """Several modes more, from the data alone, where they leave less than all of `level`: more
     of them than of other effects may be missing, and no pair comes near then."""
-    least = min((misfit(t) for t in level), default=np.inf)
-    if least <= GROSS * going.base.dof:
+    nearest = min((misfit(t) for t in level), default=np.inf)
+    if nearest <= GROSS * going.base.dof:
         return []
     going.report(0.6, "trying several modes more")
     several = [e for e in going.available if e.refines and e.restated(going.structure)]
     fits = going.run.map(as_declared, [(going.structure, going.data, e) for e in several])
     found = [tried(f.structure.effects, f, going.data) for f in fits if np.isfinite(f.chi2)]
     going.tried += found
-    return [t for t in found if misfit(t) < least]
+    return [t for t in found if misfit(t) < nearest]
 
 
 def _reform(going: UnderWay, found: Sequence[Tried]) -> list[Tried]:

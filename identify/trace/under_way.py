@@ -64,14 +64,18 @@ class UnderWay:
         return (*self.available, *self.fuller)
 
     @property
+    def explaining(self) -> list[Tried]:
+        """What explains the data, once laws have spoken against chance."""
+        return [t for t in against_chance(self.tried) if t.explains]
+
+    @property
     def explained(self) -> bool:
-        return any(t.explains for t in against_chance(self.tried))
+        return bool(self.explaining)
 
     @property
     def accounted(self) -> bool:
         """Whether something explains the data that the misfit goes with, so that it may be said."""
-        good = [t for t in against_chance(self.tried) if t.explains]
-        return any(accounts(t, self.declared, self.tried) for t in good)
+        return any(accounts(t, self.declared, self.tried) for t in self.explaining)
 
     @cached_property
     def declared(self) -> Tried:
@@ -103,10 +107,15 @@ class UnderWay:
         return [t for t in self.tried if t.spread is not None and len(t.effects) == 1]
 
     @property
+    def best(self) -> Tried | None:
+        """What would be claimed."""
+        good = self.explaining
+        return best_form(good) if good else None
+
+    @property
     def best_law(self) -> Tried | None:
-        """What would be claimed, if that is without chance."""
-        good = [t for t in against_chance(self.tried) if t.explains]
-        best = best_form(good) if good else None
+        """The same, if that is without chance."""
+        best = self.best
         return None if best is None or best.spread is not None else best
 
 
