@@ -15,11 +15,12 @@ from identify.effects.scatter import SCATTERS
 from identify.executor import InProcess
 from identify.fit import _another_sings, fit_orbits
 from identify.identification import prepare
-from identify.parameters import ParameterSet
+from identify.parameters import Estimate, ParameterSet
 from identify.pieces import Mode
-from identify.scatter import fit_scatter
+from identify.scatter import Spread, fit_scatter
 from identify.structure import MODAL, Structure
 from identify.trace import contesting, law_steps
+from identify.trace.claims import against_chance
 from identify.trace.contests import at_the_same_place, in_their_places, reformed
 from identify.trace.exchange import in_each_form, in_other_forms, joins
 from identify.trace.matched import matched
@@ -35,6 +36,7 @@ from tests.trace_material import (
     altered_campaign,
     campaign,
     fitted,
+    of_runs,
     only,
     record,
     recorded,
@@ -180,6 +182,28 @@ def test_numbers_that_must_be_tuned_speak_against_a_law(monkeypatch: pytest.Monk
     assert tuned.evidence < delay.evidence + trace.EVIDENCE
     assert trace.rivals(delay, [tuned]) == []
     assert trace.rivals(delay, [loose]) == [loose]
+
+
+@pytest.mark.parametrize(("share", "beaten"), [(0.1, True), (1e-6, False)])
+def test_a_law_tuned_to_follow_chance_does_not_speak_against_it(
+    share: float, beaten: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frequencies that wander, which six numbers of a cycle and a peak followed to within the noise
+    of ten runs. Here two numbers are tuned as finely as it takes (67196)."""
+    monkeypatch.setattr(trace.Tried, "plausible", property(lambda t: not t.objection))
+    law = known_to(share, "flame_dynamics:second_order", chi2=100.0)
+    sizes = {"parameter_drift.frequency_rms": Estimate(1e-3, 3e-4, "1")}
+    spread = Spread(law.fit, of_runs(9), sizes, 40.0, "")
+    (kind,) = (s for s in SCATTERS if s.form == "random")
+    declared = len(law.fit.theta) - 2
+    fit = replace(law.fit, theta=law.fit.theta[:declared], jacobian=np.eye(declared))
+    chance = replace(law, effects=(kind,), fit=fit, spread=spread)
+    assert law.evidence < chance.evidence - 3 * trace.EVIDENCE
+    _, judged = against_chance([law, chance])
+    assert (judged.objection != "") is beaten
+    assert trace.rivals(law, [law, judged]) == ([] if beaten else [judged])
+    # nor is chance outdone by such a free shape
+    assert trace.outdone(chance, [law]) is beaten
 
 
 def test_what_all_runs_make_far_likelier_takes_the_place_of_the_best(

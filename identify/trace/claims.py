@@ -61,10 +61,21 @@ def rivals(best: Tried, others: Sequence[Tried]) -> list[Tried]:
 
 def _less_likely(t: Tried, best: Tried) -> float:
     """By how much of χ² + p ln n the data speak for `best`: all of them, the held-out runs too. A
-    spread takes these for whatever it widens them to: its fitted runs must speak for it as well."""
+    spread takes these for whatever it widens them to: its fitted runs must speak for it as well,
+    and no more for a law of which many numbers were tuned to follow chance than for chance."""
     of_all = t.evidence_of_all - best.evidence_of_all
-    laws = t.spread is None and best.spread is None
-    return of_all if laws else min(of_all, t.evidence - best.evidence)
+    if t.spread is None and best.spread is None:
+        return of_all
+    less = min(of_all, t.evidence - best.evidence)
+    return less if best.spread is not None or t.spread is None else min(less, _tuned_less(t, best))
+
+
+def _tuned_less(t: Tried, best: Tried) -> float:
+    """The same by how finely the numbers of both had to be tuned."""
+    of_all = t.tuned_evidence - best.tuned_evidence
+    if t.spread is None and best.spread is None:
+        return of_all
+    return min(of_all, of_all - t.held_out[0] + best.held_out[0])
 
 
 def but_for_values(best: Tried, others: Sequence[Tried]) -> list[Tried]:
@@ -85,7 +96,7 @@ def _must_be_tuned(t: Tried, best: Tried) -> bool:
     """Whether one law would follow the data as well as another only with its numbers tuned so
     finely that the other is far likelier: three numbers that make what one does."""
     laws = t.spread is None and best.spread is None
-    return laws and t.tuned_evidence - best.tuned_evidence > EVIDENCE
+    return laws and _tuned_less(t, best) > EVIDENCE
 
 
 def _stands_for_another(t: Tried, best: Tried) -> bool:
@@ -197,21 +208,32 @@ def _foretold(t: Tried, error: float) -> bool:
 
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
     """A law that does better than a spread speaks against chance, even one of implausible values,
-    or one of `others`: it stands for one that is not known. So does one that comes near and
-    predicts held-out runs far better than they would scatter."""
+    or one of `others`: it stands for one that is not known. Not where so many of its numbers were
+    tuned to follow the runs that it hardly does (67196, frequencies that wander, claimed as a cycle
+    beside a peak). So does one that comes near and predicts held-out runs far better than they
+    would scatter."""
     laws = [t for t in (*tries, *others) if t.spread is None]
-    least = min((t.evidence for t in laws if t.adequate), default=np.inf)
+    good = [t for t in laws if t.adequate]
     # what misses the fitted runs by far meets a few held-out ones by luck (43096)
     near = [t for t in laws if t.held_out[1] and t.fit.chi2_per_dof < MUCH]
     nearest = min((t.validation_error for t in near), default=np.inf)
     out = []
     for t in tries:
-        if t.spread is not None and (t.evidence > least or _foretold(t, nearest)):
+        if t.spread is not None and (_bettered(t, good) or _foretold(t, nearest)):
             spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
             out.append(replace(t, spread=spread))
         else:
             out.append(t)
     return out
+
+
+def _bettered(t: Tried, others: Sequence[Tried]) -> bool:
+    """Whether one of `others` is likelier; a law than chance, by far with its numbers tuned too."""
+    return any(
+        o.evidence < t.evidence
+        and (t.spread is None or o.spread is not None or _tuned_less(t, o) > EVIDENCE)
+        for o in others
+    )
 
 
 def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
@@ -239,7 +261,7 @@ def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
     nobody has named, and `t` only comes near to it. Chance at one place is asked so of chance at
     another alone."""
     good = [p for p in pieces if (p.adequate if p.spread is None else p.explains and t.spread)]
-    return any(p.evidence < t.evidence - EVIDENCE for p in good)
+    return _bettered(t, [p for p in good if p.evidence < t.evidence - EVIDENCE])
 
 
 def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:

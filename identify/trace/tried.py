@@ -32,7 +32,8 @@ LEFT_P = 0.03  # chance below which what a spread leaves is more than noise …
 LEFT_BESIDE_P = 0.1  # … and with a law beside it: the best of so many laws leaves less by chance
 HELD_OUT_P = 0.01  # the same of held-out runs, which no law beside it has been chosen by
 EVIDENCE = 10.0  # difference of χ² + p ln n that rules a rival out («very strong»)
-DECADES = 4.0  # over which the size of an effect may lie beforehand
+DECADES = 4.0  # over which the size of an effect may lie beforehand …
+DECADE_WIDTH = float(DECADES * np.log(10.0) / np.sqrt(2 * np.pi))  # … as ln of it, for a Gaussian
 TINY = 1e-9  # of a number's scale: no smaller size is told apart
 LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
@@ -139,16 +140,20 @@ class Tried:
 
     @property
     def tuned_evidence(self) -> float:
-        """−2 ln of the probability of the data (of laws), but for what the declared model's own
-        numbers share: χ² of all runs, and how finely the effects' own had to be tuned, by Laplace's
-        method. Beforehand the size of an effect is as likely in any of `DECADES` decades."""
-        own = [q for e in self.effects for q in e.parameters]
+        """−2 ln of the probability of the data, but for what the declared model's own numbers
+        share: deviance of all runs, and how finely the effects' own had to be tuned, by Laplace's
+        method. Beforehand a size, of an effect or of chance, is as likely in any of `DECADES`
+        decades."""
+        own = [q for e in self.effects if not isinstance(e, Scatter) for q in e.parameters]
         widths = np.array([_width(q, self.fit.values[q.name]) for q in own])
         beforehand = np.zeros((len(own), self.fit.theta.size))
         at = [self.fit.structure.parameters.index[q.name] for q in own]
         beforehand[range(len(own)), at] = 1.0 / widths
         known = log_determinant_of(np.vstack([self.fit.jacobian, beforehand]))
-        return float(self.chi2_of_all + known + 2 * np.log(widths).sum())
+        known += float(2 * np.log(widths).sum())
+        if self.spread is not None:
+            known += sum(_tuned(e) for e in self.spread.sizes.values())
+        return self.deviance + self.held_out[0] + known
 
     @property
     def evidence_of_all(self) -> float:
@@ -250,12 +255,16 @@ def _foreseen(fit: Fit, data: Dataset) -> tuple[Fit, list[assess.Prediction]]:
     return min(found, key=lambda item: assess.held_out_misfit(item[1], item[0].covariance)[0])
 
 
+def _tuned(size: Estimate) -> float:
+    """How finely the size of a spread had to be tuned: 2 ln(width beforehand / standard error)."""
+    return float(np.log1p((DECADE_WIDTH * size.value / size.stderr) ** 2))
+
+
 def _width(q: Parameter, value: float) -> float:
     """Standard deviation, in its internal unit, of where a number may lie beforehand."""
     if q.kind == "positive" and np.isfinite(q.upper) and q.lower > 0:
         return float(np.log(q.upper / q.lower) / np.sqrt(2 * np.pi))
-    decades = float(DECADES * np.log(10.0) / np.sqrt(2 * np.pi))
-    return decades * (1.0 if q.kind == "positive" else max(abs(value) / q.scale, TINY))
+    return DECADE_WIDTH * (1.0 if q.kind == "positive" else max(abs(value) / q.scale, TINY))
 
 
 def best_by_name(tries: Sequence[Tried]) -> list[Tried]:
