@@ -11,6 +11,7 @@ from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
 from identify.structure import MODAL, Structure
+from identify.trace import law_steps
 from identify.trace.contesting import DOUBT, one_more
 from identify.trace.contests import NEAR, varied
 from identify.trace.fewer import with_fewer
@@ -93,6 +94,25 @@ def test_pairs_that_the_tangents_promise(tmp_path: Path) -> None:
     assert not any(t.explains for t in singles)
     done = {t.key_of_forms for t in found}
     assert not done & {t.key_of_forms for t in foreseen(singles, ready.data, available, done, run)}
+
+
+@pytest.mark.parametrize("last", [False, True])
+def test_what_the_tangents_promised_last_is_tried_in_other_forms(
+    last: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A compression and a saturation that are both gross: no single is near, and the pair stood
+    where the tangents had led it, in a form that leaves too much to be near (67315). What is grown
+    from is tried in other forms there."""
+    pair = tried_as(
+        fitted(14, 304.0), "actuator_nonlinearity:cubic", "nonlinearity_shape:quartic_quintic"
+    )
+    better = tried_as(fitted(13, 1.0), "actuator_nonlinearity:cubic", "nonlinearity_shape:tanh")
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    monkeypatch.setattr(law_steps, "foreseen", lambda *a: [pair])
+    monkeypatch.setattr(law_steps, "reformed", lambda found, *rest: [better] if found else [])
+    going = searching(fitted(11, 2.5e5))
+    law_steps.try_foreseen(going, last=last)
+    assert going.tried == ([pair, better] if last else [pair])
 
 
 @pytest.mark.slow

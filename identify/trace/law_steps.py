@@ -135,13 +135,19 @@ def plainest(going: UnderWay, singles: Sequence[Tried]) -> list[Tried]:
     return [best] if misfit(best) < PLAINLY * going.base.chi2 else []
 
 
-def try_foreseen(going: UnderWay) -> None:
-    """The pairs that promise most beside each effect alone."""
+def try_foreseen(going: UnderWay, last: bool = False) -> None:
+    """The pairs that promise most beside each effect alone; where nothing is grown any more, at
+    `last`, the best of them led on, and in other forms (67315, a speaker that compresses and a
+    flame that saturates, both gross)."""
     going.report(0.95, "fitting pairs that the score tests foresee")
     alone = [t for t in going.laws if len(t.effects) == 1 and t.plausible and t.fit.converged]
     known = {t.key_of_forms for t in going.laws if t.plausible}
     singles = best_of_each_form(alone)
-    going.tried += foreseen(singles, going.data, going.apart, known, going.run)
+    found = foreseen(singles, going.data, going.apart, known, going.run)
+    if last:
+        found += led_on(found, going.data, going.run)
+        found += _reform(going, found)
+    going.tried += found
 
 
 def try_more_modes(going: UnderWay, level: Sequence[Tried]) -> list[Tried]:

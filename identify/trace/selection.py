@@ -118,7 +118,7 @@ def search(
     if going.seeking():
         try_each_alone(going, scores)
         if depth > 1 and going.seeking():
-            try_foreseen(going)
+            try_foreseen(going, last=True)
     contest(going)
     if one_more(going, depth):
         contest(going)
