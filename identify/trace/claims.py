@@ -209,7 +209,7 @@ def _foretold(t: Tried, error: float) -> bool:
 def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list[Tried]:
     """A law that does better than a spread speaks against chance, even one of implausible values,
     or one of `others`: it stands for one that is not known. Not where so many of its numbers were
-    tuned to follow the runs that it hardly does (67196, frequencies that wander, claimed as a cycle
+    tuned to follow the runs that it does not (67196, frequencies that wander, claimed as a cycle
     beside a peak). So does one that comes near and predicts held-out runs far better than they
     would scatter."""
     laws = [t for t in (*tries, *others) if t.spread is None]
@@ -219,7 +219,7 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
     nearest = min((t.validation_error for t in near), default=np.inf)
     out = []
     for t in tries:
-        if t.spread is not None and (_bettered(t, good) or _foretold(t, nearest)):
+        if t.spread is not None and (_bettered(t, good, by=0.0) or _foretold(t, nearest)):
             spread = replace(t.spread, objection=t.spread.objection or BEATEN, luck=0.0)
             out.append(replace(t, spread=spread))
         else:
@@ -227,11 +227,12 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
     return out
 
 
-def _bettered(t: Tried, others: Sequence[Tried]) -> bool:
-    """Whether one of `others` is likelier; a law than chance, by far with its numbers tuned too."""
+def _bettered(t: Tried, others: Sequence[Tried], by: float) -> bool:
+    """Whether one of `others` is likelier `by` so much; a law than chance, with its numbers tuned
+    too."""
     return any(
-        o.evidence < t.evidence
-        and (t.spread is None or o.spread is not None or _tuned_less(t, o) > EVIDENCE)
+        o.evidence < t.evidence - by
+        and (t.spread is None or o.spread is not None or _tuned_less(t, o) > by)
         for o in others
     )
 
@@ -261,7 +262,7 @@ def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
     nobody has named, and `t` only comes near to it. Chance at one place is asked so of chance at
     another alone."""
     good = [p for p in pieces if (p.adequate if p.spread is None else p.explains and t.spread)]
-    return _bettered(t, [p for p in good if p.evidence < t.evidence - EVIDENCE])
+    return _bettered(t, good, by=EVIDENCE)
 
 
 def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
