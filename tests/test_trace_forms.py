@@ -44,6 +44,7 @@ from simulated_rig.plant import Plant
 from simulated_rig.random_rigs import random_campaign, random_rig
 from tests.test_identify_balance import forced_conditions
 from tests.trace_material import (
+    Supposed,
     altered_campaign,
     drawn_values,
     fitted,
@@ -539,7 +540,7 @@ def spread_of(evidence: float, objection: str) -> trace.Tried:
     sizes = 2 * float(np.log(fit.residual.size))
     none = dict.fromkeys("ab")
     spread = Spread(fit, of_runs(15), none, evidence - sizes, objection)  # type: ignore[arg-type]
-    return trace.Tried((drive,), fit, 1e-3, 0.5, 0.5, spread)
+    return Supposed((drive,), fit, 1e-3, 0.5, 0.5, spread)
 
 
 @pytest.mark.parametrize(
