@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -151,7 +152,7 @@ def searching(
 class Supposed(trace.Tried):
     """A set of effects with a fit of which only the misfit and the count of numbers are given."""
 
-    @property
+    @cached_property
     def tuned_evidence(self) -> float:
         return self.evidence_of_all
 

@@ -67,15 +67,13 @@ def _less_likely(t: Tried, best: Tried) -> float:
     if t.spread is None and best.spread is None:
         return of_all
     less = min(of_all, t.evidence - best.evidence)
-    return less if best.spread is not None or t.spread is None else min(less, _tuned_less(t, best))
+    return less if best.spread is not None else min(less, _tuned_less(t, best))
 
 
-def _tuned_less(t: Tried, best: Tried) -> float:
-    """The same by how finely the numbers of both had to be tuned."""
-    of_all = t.tuned_evidence - best.tuned_evidence
-    if t.spread is None and best.spread is None:
-        return of_all
-    return min(of_all, of_all - t.held_out[0] + best.held_out[0])
+def _tuned_less(chance: Tried, law: Tried) -> float:
+    """The same for a law, by how finely its numbers and the size of chance had to be tuned."""
+    of_all = chance.tuned_evidence - law.tuned_evidence
+    return min(of_all, of_all - chance.held_out[0] + law.held_out[0])
 
 
 def but_for_values(best: Tried, others: Sequence[Tried]) -> list[Tried]:
@@ -96,7 +94,7 @@ def _must_be_tuned(t: Tried, best: Tried) -> bool:
     """Whether one law would follow the data as well as another only with its numbers tuned so
     finely that the other is far likelier: three numbers that make what one does."""
     laws = t.spread is None and best.spread is None
-    return laws and _tuned_less(t, best) > EVIDENCE
+    return laws and t.tuned_evidence - best.tuned_evidence > EVIDENCE
 
 
 def _stands_for_another(t: Tried, best: Tried) -> bool:

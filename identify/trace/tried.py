@@ -7,6 +7,7 @@ only weigh candidates that are adequate already: χ² + p ln n, within 10 of the
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -138,7 +139,7 @@ class Tried:
         more = 0 if self.spread is None else len(self.spread.sizes)
         return self.deviance + (self.fit.theta.size + more) * float(np.log(self.fit.residual.size))
 
-    @property
+    @cached_property
     def tuned_evidence(self) -> float:
         """−2 ln of the probability of the data, but for what the declared model's own numbers
         share: deviance of all runs, and how finely the effects' own had to be tuned, by Laplace's
