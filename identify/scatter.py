@@ -12,7 +12,8 @@ there, and e_r = ρ_r(θ, x̂_r) − T_r x̂_r,
 and what they absorb of the runs' deviations must not pass for their smallness. The two alternate.
 ln det V is what the freedom costs: a spread never explains for nothing what a law explains. A
 spread must also look random (`identify.randomness`): what follows the runs' conditions or time, or
-sits in a single run, has another cause.
+sits in a single run, has another cause. What the experiment itself drifts by at random may wander:
+its likelihood is the greater of both (`identify.wander`).
 """
 
 from collections.abc import Sequence
@@ -31,6 +32,7 @@ from identify.parameters import Estimate
 from identify.randomness import law_in
 from identify.start import distant_starts
 from identify.structure import Structure
+from identify.wander import likelier
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -69,6 +71,7 @@ class Spread:
     objection: str
     luck: float = 1.0  # chance of what is objected to, were the deviations random; 0: not so asked
     unrivalled: bool = False  # no law comes near (`identify.trace.claims.unrivalled`)
+    wandering: float = 0.0  # by how much −2 ln L is less for deviations that wander in time
 
 
 @dataclass(frozen=True)
@@ -187,8 +190,18 @@ def _alternate(
         q.name: Estimate(float(s), float(s * e), q.unit)
         for q, s, e in zip(scatter.parameters, sizes, errors, strict=True)
     }
-    fit = _fit(structure, led, rows, sizes)
-    return Spread(fit, wide, named, _penalty(rows, sizes), *_objection(rows, sizes, scatter))
+    fit, penalty = _fit(structure, led, rows, sizes), _penalty(rows, sizes)
+    wandering = _wandering(rows, fit.chi2 + penalty) if scatter.wanders else 0.0
+    said, luck = _objection(rows, sizes, scatter)
+    return Spread(fit, wide, named, penalty, said, luck, wandering=wandering)
+
+
+def _wandering(rows: Sequence[_Rows], deviance: float) -> float:
+    """By how much −2 ln L is less than `deviance` where the one direction's deviations wander."""
+    none = np.zeros(1)
+    tangent = _tangents(rows, none, np.arange(1))[..., 0]
+    started_s = np.concatenate([r.batch.started_s for r in rows])
+    return likelier(*_whitened(rows, none), tangent, started_s, deviance)
 
 
 def _fit(structure: Structure, led: Led, rows: Sequence[_Rows], sizes: FloatArray) -> Fit:
@@ -362,8 +375,9 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> tu
     if not there.size:
         return NOTHING, 0.0
     residual, jacobian = _whitened(rows, sizes)
-    deviations = _forced_tangents(rows, sizes, there)
-    if scatter.location == "experiment":  # what wanders follows by chance what goes with the time
+    forced_runs = np.concatenate([np.full(r.batch.runs, not r.batch.free) for r in rows])
+    deviations = _tangents(rows, sizes, there)[:, forced_runs]
+    if scatter.wanders:  # what wanders follows by chance what goes with the time
         trends = np.stack([known["time"], known["time" + SQUARED]], axis=1)
         slow = np.einsum("nmq,mk->nqk", deviations, trends).reshape(residual.size, -1)
         jacobian = np.c_[jacobian, slow]
@@ -395,23 +409,21 @@ def _conditions(
     laws: list[tuple[str, ...]] = [("frequency",), ("drive",), ("response",)]
     laws.append(("frequency", "drive", "response"))
     laws.append(("drive", "frequency", "frequency" + SQUARED))
-    if scatter.location != "experiment":  # what wanders in the course of it may follow the time
+    if not scatter.wanders:  # what wanders in the course of it may follow the time
         ranked.append("time")
         laws += [("time",), ("time", "time" + SQUARED)]
     return known, ranked, laws
 
 
-def _forced_tangents(rows: Sequence[_Rows], sizes: FloatArray, there: IntArray) -> FloatArray:
-    """The forced runs' tangents (n, runs, directions) `there`, n counting all runs' residuals,
-    whitened by noise and spread."""
-    tangent = []
+def _tangents(rows: Sequence[_Rows], sizes: FloatArray, there: IntArray) -> FloatArray:
+    """The runs' tangents (n, runs, directions) `there`, n counting all runs' residuals, whitened
+    by noise and spread."""
+    own: list[FloatArray] = []
     for r in rows:
         L = np.linalg.cholesky(_spread(r, sizes))
-        tangent += [(t, r.batch.free) for t in np.linalg.solve(L, r.tangent[..., there])]
-    ends = np.cumsum([len(t) for t, _ in tangent])
-    forced = [i for i, (_, free) in enumerate(tangent) if not free]
-    out = np.zeros((int(ends[-1]), len(forced), there.size))
-    for column, i in enumerate(forced):
-        own, _ = tangent[i]
-        out[ends[i] - len(own) : ends[i], column] = own
+        own += list(np.linalg.solve(L, r.tangent[..., there]))
+    ends = np.cumsum([len(t) for t in own])
+    out = np.zeros((int(ends[-1]), len(own), there.size))
+    for run, (end, t) in enumerate(zip(ends, own, strict=True)):
+        out[end - len(t) : end, run] = t
     return out

@@ -47,6 +47,11 @@ class Scatter(Effect):
         )
         self.directions = tuple(direction for _, _, direction in sizes)
 
+    @property
+    def wanders(self) -> bool:
+        """Whether runs near each other in time may deviate alike; along one direction."""
+        return self.location == "experiment"
+
 
 class Change(Direction):
     """A change of frequency or flame gain, as the logarithm of its ratio."""

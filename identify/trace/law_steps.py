@@ -78,8 +78,9 @@ def try_each_alone(going: UnderWay, scores: Mapping[str, ScoreTest] | None) -> N
 
 
 def try_pairs(going: UnderWay, singles: Sequence[Tried]) -> list[Tried]:
-    """Two effects sought at once, unless some together explain the data already."""
-    if any(t.explains and len(t.effects) > 1 for t in going.tried):
+    """Two effects sought at once, unless some together explain the data already, or chance alone:
+    gross laws leave no runs that lie at random along the directions that it knows."""
+    if going.by_chance or any(t.explains and len(t.effects) > 1 for t in going.tried):
         return []
     pairs = pairs_from_afar(
         going.structure, going.data, going.base, going.apart, singles, going.run,

@@ -131,7 +131,8 @@ class Tried:
     @property
     def deviance(self) -> float:
         """χ², and what the likelihood pays for noise that is widened."""
-        return self.fit.chi2 + self.grown + (0.0 if self.spread is None else self.spread.penalty)
+        s = self.spread
+        return self.fit.chi2 + self.grown + (0.0 if s is None else s.penalty - s.wandering)
 
     @property
     def evidence(self) -> float:
