@@ -32,6 +32,7 @@ LEAD_IN_STEPS = 3  # Newton steps towards each orbit while leading in
 SHORTLY = 10  # iterations for what may be given up as hopeless: only fits near to the noise matter
 FADES = 0.1  # of another's flame residue: less of it in mode 1 may be none
 SAME = 1.0  # of χ²: what two ends of descents differ by that are the same, modes renumbered or not
+UNSEEN = 1e-13  # singular value, relative to the largest, of what the data say nothing of
 
 
 @dataclass(frozen=True)
@@ -106,13 +107,24 @@ def log_determinant_of(jacobian: FloatArray) -> float:
     return float(2 * (np.log(norm).sum() + np.log(sv).sum()))
 
 
+def profiled(residual: FloatArray, jacobian: FloatArray) -> tuple[float, float]:
+    """χ² that is left of residuals (n,) where the parameters of a linear model, `jacobian` (n, p),
+    are at their best, and ln det JᵀJ of those that the data tell of."""
+    norm = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
+    left, sv, _ = np.linalg.svd(jacobian / norm, full_matrices=False)
+    told = sv > UNSEEN * sv[0]
+    absorbed = left[:, told].T @ residual
+    chi2 = float(residual @ residual - absorbed @ absorbed)
+    return chi2, float(2 * (np.log(sv[told]).sum() + np.log(norm).sum()))
+
+
 def _scaled(jacobian: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Lengths of the columns, and singular values and directions of all of one length, none of the
     values below what can be told from zero."""
     norm = np.sqrt(np.sum(jacobian**2, axis=0))
     norm = np.where(norm > 1e-100, norm, 1e-100)
     _, sv, Vt = np.linalg.svd(jacobian / norm, full_matrices=False)
-    return norm, np.maximum(sv, 1e-13 * max(float(sv[0]), 1e-300)), Vt
+    return norm, np.maximum(sv, UNSEEN * max(float(sv[0]), 1e-300)), Vt
 
 
 def fit_orbits(

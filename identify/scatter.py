@@ -26,7 +26,7 @@ from identify import assess
 from identify.chances import beta_tail, rank_correlation
 from identify.dataset import Batch, Dataset
 from identify.effects.scatter import Scatter
-from identify.fit import Fit, resolved
+from identify.fit import Fit, profiled, resolved
 from identify.own import Led, Own, lead, settle
 from identify.parameters import Estimate
 from identify.randomness import law_in
@@ -44,7 +44,6 @@ TREND_P = 0.003  # a rank correlation less probable than this is a law, not chan
 NOTHING = "no run deviates"  # an objection
 ONE_RUN = 0.9  # share of all deviation that a single run may hold, whatever their number
 SMALLEST = 1e-8
-UNSEEN = 1e-13  # singular value, relative to the largest, of what the data say nothing of
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
 HOPELESS = 5.0  # χ² a residual beyond which further rounds, or less noise, mend nothing …
 FAR = 30.0  # … and at first, when σ is no more than a guess
@@ -289,13 +288,8 @@ def _widen(rows: _Rows, sizes: FloatArray) -> Batch:
 
 def _deviance(rows: Sequence[_Rows], sizes: FloatArray) -> float:
     """−2 ln of the restricted likelihood, up to a constant."""
-    residual, jacobian = _whitened(rows, sizes)
-    scale = 1 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
-    left, values, _ = np.linalg.svd(jacobian * scale, full_matrices=False)
-    kept = values > UNSEEN * values[0]
-    logdet = 2 * float(np.sum(np.log(values[kept])) - np.sum(np.log(scale)))
-    absorbed = left[:, kept].T @ residual
-    return _penalty(rows, sizes) + float(residual @ residual - absorbed @ absorbed) + logdet
+    chi2, logdet = profiled(*_whitened(rows, sizes))
+    return _penalty(rows, sizes) + chi2 + logdet
 
 
 def _whitened(rows: Sequence[_Rows], sizes: FloatArray) -> tuple[FloatArray, FloatArray]:

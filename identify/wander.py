@@ -16,11 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from identify.fit import profiled
+
 FloatArray = npt.NDArray[np.float64]
 
 FINEST, COARSEST = 1e-8, 1.0  # σ of a ratio's logarithm, at the end of the campaign
 STEPS = 60  # of ln σ in between, and as many about the best of these
-UNSEEN = 1e-13  # singular value, relative to the largest, of what the data say nothing of
 
 
 def likelier(
@@ -76,11 +77,6 @@ class _Loaded:
         grown = 1.0 + variance * self.squared
         shrunk = (1.0 - 1.0 / np.sqrt(grown))[:, None] * (self.axes.T @ self.both)
         whole = self.both - self.axes @ shrunk
-        residual, jacobian = whole[:, 0], whole[:, 1:]
-        scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
-        left, values, _ = np.linalg.svd(jacobian / scale, full_matrices=False)
-        kept = values > UNSEEN * values[0]
-        absorbed = left[:, kept].T @ residual
-        deviance = float(residual @ residual - absorbed @ absorbed + np.log(grown).sum())
-        known = float(np.log(values[kept]).sum() + np.log(scale).sum())
-        return deviance + 2 * known, deviance
+        chi2, known = profiled(whole[:, 0], whole[:, 1:])
+        deviance = chi2 + float(np.log(grown).sum())
+        return deviance + known, deviance
