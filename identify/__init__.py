@@ -7,8 +7,8 @@ model is made of, `identify.effects` for the candidates. What is where:
 recordings      `record`, `load`, `quality`, `harmonics`, `linenoise`, `quantisation`, `dataset`
 the loop        `pieces`, `effect`, `effects`, `structure`, `declare`, `parameters`, `dual`
 steady states   `periods`, `polynomial`, `newton`, `balance`, `stability`, `lockin`
-fits            `residual`, `descent`, `fit`, `start`, `profile`, `own`, `scatter`, `drive`,
-                `corrected`
+fits            `residual`, `descent`, `fit`, `start`, `profile`, `own`, `scatter`, `wander`,
+                `drive`, `corrected`
 judgement       `assess`, `whiteness`, `randomness`, `chances`, `trace`, `verdict`, `signature`
 next runs       `reach`, `foresee`, `design`
 in and out      `identification`, `diagnosis`, `results`, `report`, `export`, `statespace`,

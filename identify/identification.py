@@ -112,9 +112,7 @@ def identify(
     report(0.0, "measuring harmonics")
     ready = prepare(campaign, structure)
     report(0.2, "fitting the declared model")
-    fit = fit_structure(ready.structure, ready.data)
-    data, fit = corrected.refitted(fit, ready.data)
-    data, fit = drive.refitted(fit, data)
+    fit, data = fit_prepared(ready)
     report(0.9, "validating")
     assessment = replace(assess.assess(fit, data), lock_in=assess.lock_in((fit, data)))
     report(0.95, "intervals")
@@ -129,6 +127,14 @@ def identify(
         undetermined=undetermined(fit, data),
         intervals=bounds,
     )
+
+
+def fit_prepared(ready: Prepared) -> tuple[Fit, Dataset]:
+    """The fit of a campaign's structure, and the data with the noise as that fit corrects it."""
+    fit = fit_structure(ready.structure, ready.data)
+    data, fit = corrected.refitted(fit, ready.data)
+    data, fit = drive.refitted(fit, data)
+    return fit, data
 
 
 def fit_structure(structure: Structure, data: Dataset) -> Fit:

@@ -19,11 +19,10 @@ from daq.store import RunStore
 from identify import design
 from identify.diagnosis import diagnose
 from identify.fit import Fit
-from identify.identification import Prepared, identify, prepare
+from identify.identification import Prepared, fit_prepared, prepare
 from identify.load import load_campaign
 from identify.reach import Cost, Option, Reach
 from identify.record import Campaign, DeclaredModel
-from identify.structure import Structure
 
 Progress = Callable[[float, str], None]
 DECLARED = "declared"
@@ -107,7 +106,9 @@ def _fitted(campaign: Campaign, progress: Progress | None = None) -> tuple[Fit, 
     key = repr((campaign.identifier, campaign.declared_model, runs))
     if not _LAST or _LAST[0][0] != key:
         ready = prepare(campaign)
-        _LAST[:] = [(key, identify(campaign, progress=progress).assessment.fit, ready)]
+        if progress is not None:
+            progress(0.2, "fitting the declared model")
+        _LAST[:] = [(key, fit_prepared(ready)[0], ready)]
     return _LAST[0][1:]
 
 
@@ -135,7 +136,12 @@ def _told_apart(plan: Plan, campaign: Campaign, progress: Progress | None) -> di
             raise ValueError(f"its diagnosis proposes no experiment. {found['explanation']}")
         return _proposed(found["next_experiment"], plan.design)
     ready = prepare(campaign)
-    rivals = [_rival(name, ready) for name in plan.design.rivals]
+    named = [(name, _with_rival(ready, name)) for name in plan.design.rivals]
+    rivals = []
+    for i, (name, one) in enumerate(named):
+        if progress is not None:
+            progress(i / len(named), f"fitting {name}")
+        rivals.append(design.Rival(name, fit_prepared(one)[0]))
     reach = design.reach_in(ready)
     told = design.tell_apart(rivals, ready, reach).options
     chosen = design.Chosen(_within(told, plan.design, reach.cost))
@@ -171,22 +177,19 @@ def _within(options: Sequence[Option], wanted: Design, cost: Cost) -> tuple[Opti
     return tuple(kept)
 
 
-def _rival(name: str, ready: Prepared) -> design.Rival:
-    """The declared model with the named effect in it, fitted."""
-    structure = ready.structure if name == DECLARED else _with_effect(name, ready.structure)
-    fit = identify(ready.campaign, structure=structure).assessment.fit
-    return design.Rival(name, fit)
-
-
-def _with_effect(name: str, structure: Structure) -> Structure:
-    """Raises ValueError listing the names that are known."""
+def _with_rival(ready: Prepared, name: str) -> Prepared:
+    """The campaign with the named effect in its declared structure; as it is, where that is its
+    name. Raises ValueError listing the names that are known."""
     from identify.effects import CATALOGUE
 
+    if name == DECLARED:
+        return ready
     fitting = [effect for effect in CATALOGUE if name in (effect.key, effect.name)]
     if not fitting:
         known = sorted({effect.key for effect in CATALOGUE})
         raise ValueError(f"rivals: {name!r} is not one of {[DECLARED, *known]}")
-    return replace(structure, effects=(*structure.effects, fitting[0]))
+    effects = ready.data.among((*ready.structure.effects, fitting[0]))
+    return replace(ready, structure=replace(ready.structure, effects=effects))
 
 
 def _options(plan: Plan, reach: Reach) -> tuple[Option, ...]:
