@@ -16,7 +16,7 @@ from identify.wander import likelier
 from tests.trace_material import thesis_campaign
 
 FloatArray = npt.NDArray[np.float64]
-RUNS, EACH, SHARED, STEP = 10, 6, 4, 30.0
+RUNS, EACH, SHARED, STEP = 10, 4, 3, 30.0
 TOLD = 1e4  # how finely a run tells what it deviates by, in units of one
 SIZE = 8.0 / TOLD
 DRIFT = next(s for s in SCATTERS if s.name == "parameter_drift")
@@ -47,10 +47,10 @@ def deviance(
         found = float(rest @ inverse @ rest) + float(np.linalg.slogdet(V)[1])
         return found + float(np.linalg.slogdet(normal)[1]), found
 
-    tried = np.linspace(-36.0, 0.0, 300)
+    tried = np.linspace(-30.0, 0.0, 75)
     near = tried[np.argmin([both(v)[0] for v in tried])]
     best = optimize.minimize_scalar(
-        lambda v: both(v)[0], bounds=(near - 0.2, near + 0.2), method="bounded"
+        lambda v: both(v)[0], bounds=(near - 0.5, near + 0.5), method="bounded"
     )
     return both(float(best.x))[1]
 
@@ -72,15 +72,16 @@ def test_the_likelihood_is_that_of_the_definition() -> None:
 
 
 def test_what_is_drawn_anew_does_not_wander() -> None:
+    """A likelihood ten times as great comes about in less than one case of ten."""
     rng = np.random.default_rng(5)
     gains = []
-    for _ in range(40):
+    for _ in range(100):
         jacobian, tangent, started_s = rows(rng)
         residual = rng.normal(size=RUNS * EACH) + SIZE * tangent @ rng.normal(size=RUNS)
         anew = deviance(residual, jacobian, tangent, np.eye(RUNS))
         gains.append(likelier(residual, jacobian, tangent, started_s, anew))
     assert np.median(gains) == 0.0
-    assert np.mean(np.array(gains) > 6.0) < 0.05
+    assert np.mean(np.array(gains) > 2 * np.log(10.0)) < 0.1
 
 
 def test_runs_at_one_time_tell_nothing_of_it() -> None:
