@@ -14,15 +14,19 @@ from identify.structure import MODAL, Structure
 from identify.trace import law_steps
 from identify.trace.contesting import DOUBT, one_more
 from identify.trace.contests import NEAR, varied
+from identify.trace.exchange import joins
 from identify.trace.fewer import with_fewer
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place
 from identify.trace.restated import renamed
-from identify.trace.tried import tried
+from identify.trace.tried import best_form, tried
+from simulated_rig.effects import make_effect
+from simulated_rig.random_rigs import random_rig
 from tests.trace_material import (
     fitted,
     only,
+    record,
     search_for,
     searching,
     thesis_campaign,
@@ -423,3 +427,36 @@ def test_of_two_that_explain_the_data_one_may_lack_another_form(tmp_path: Path) 
     assert best.key_of_forms == (delay.key, drift.key)
     assert best.evidence < pairs[0].evidence - trace.EVIDENCE
     assert {len(t.effects) for t in going.tried} == {2}
+
+
+@pytest.mark.parametrize(
+    ("form", "beside", "may"),
+    [
+        ("flame_dynamics:pole", "flame_dynamics:distributed_delay", True),
+        ("flame_dynamics:pole", "flame_delay", True),
+        ("flame_dynamics:pole", "flame_dynamics:second_time_scale", False),  # one time_s for both
+        ("actuator_dynamics:pole", "actuator_dynamics:resonance", False),
+    ],
+)
+def test_two_laws_of_one_name_stand_together_where_both_are_met(
+    form: str, beside: str, may: bool
+) -> None:
+    assert joins(by_key(form), [by_key(beside)]) is may
+
+
+@pytest.mark.slow
+def test_two_laws_of_one_flame(tmp_path: Path) -> None:
+    """A further pole and a distributed delay go by one name; a delay in the place of the pole
+    explains the data too, and had been claimed for it (68051 of the study)."""
+    effects = [
+        make_effect("flame_dynamics/extra_pole", {"pole_hz": 905.4}),
+        make_effect("flame_dynamics/distributed_delay", {"mean_delay_s": 2.195e-4}),
+    ]
+    rig = random_rig(68051, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    ready = record(tmp_path, 68051, rig, effects, forced=7, validation=2)
+    base = start.fit_from_data(ready.structure, ready.data)
+    forms = [by_key("flame_delay"), *(e for e in CATALOGUE if e.name == "flame_dynamics")]
+    found = trace.search(ready.structure, ready.data, base, catalogue=forms, depth=2)
+    good = [t for t in found.tried if t.explains]
+    assert ("flame_delay", "flame_dynamics") in {t.key for t in good}
+    assert best_form(good).key == ("flame_dynamics", "flame_dynamics")

@@ -12,7 +12,7 @@ import numpy as np
 from identify.dataset import Dataset
 from identify.effect import Effect
 from identify.executor import Executor, Progress
-from identify.trace.exchange import Exchange, exchanged, forms_in_place, in_each_form
+from identify.trace.exchange import Exchange, exchanged, forms_in_place, in_each_form, joins
 from identify.trace.fewer import eliminate, part_of, with_fewer
 from identify.trace.stages import try_effects
 from identify.trace.to_the_end import UNSETTLED
@@ -189,7 +189,8 @@ def at_the_same_place(
         for kept in [tuple(o for o in t.effects if o is not old)]
         for e in available
         if _may_stand_for(e, old, t)
-        and e.name not in t.names
+        and e.name != old.name
+        and joins(e, kept)
         and not e.refines
         and key_of_forms((*kept, e)) not in done
     ]
@@ -237,10 +238,9 @@ def in_their_places(
             continue
         if kept and extended.get(key_of_forms(kept), np.inf) < 2 * base.chi2:
             continue  # what stands beside it from about there has been seen
-        names = {e.name for e in kept}
         out += try_effects(
             base.structure, data, base,
-            [a for a in available if a.name not in names and a.key not in already],
+            [a for a in available if joins(a, kept) and a.key not in already],
             executor=run, keep=5, far=False, scores=None if kept else {}, rivals=True,
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
@@ -261,6 +261,9 @@ def _from_the_end(
     others = [
         (t, kept, old, e, data)
         for e in available
-        if e.name not in t.names and not e.refines and key_of_forms((*kept, e)) not in done
+        if e.name != old.name
+        and joins(e, kept)
+        and not e.refines
+        and key_of_forms((*kept, e)) not in done
     ]
     return exchanged(others, data, run)

@@ -24,7 +24,8 @@ FloatArray = npt.NDArray[np.float64]
 #: A set of effects, those of them that are kept, the one that is not, what comes in its place.
 Exchange = tuple[Tried, tuple[Effect, ...], Effect, Effect, Dataset]
 
-TOGETHER = ("nonlinearity_shape", "actuator_nonlinearity")  # of which two laws may be met at once
+#: Of which two laws may be met at once.
+TOGETHER = ("nonlinearity_shape", "actuator_nonlinearity", "flame_dynamics")
 #: Places whose effects are responses that others may be like, and what else is moved for that.
 MOVING = {"flame": "flame.", "actuator": "flame.", "forward": "mode"}
 REFINED = 1500  # iterations of a form that refines another: a long valley may lie between …
