@@ -695,3 +695,19 @@ def test_many_laws_follow_what_is_slight(tmp_path: Path) -> None:
     assert "far less likely" in found.explanation
     assert found.whereabouts is not None
     assert "flame" in found.whereabouts.likely
+
+
+@pytest.mark.parametrize(("gain", "asked_for"), [(5.5, False), (9.0, True)])
+def test_what_a_law_extends_is_claimed_unless_the_extension_is_asked_for(
+    monkeypatch: pytest.MonkeyPatch, gain: float, asked_for: bool
+) -> None:
+    """A pure delay had been claimed as one that is spread, which followed the noise a little more
+    closely (68029); where it gains more than by luck, both are named."""
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    delay = tried_as(fitted(10, 1.0), "flame_delay")
+    fit = fitted(11, 1.0)
+    fit = replace(fit, chi2=delay.fit.chi2 - gain)
+    distributed = tried_as(fit, "flame_dynamics:distributed_delay")
+    both = [delay, distributed]
+    assert trace.best_form(both) is distributed
+    assert trace.claimed(both, both) == ((distributed, [delay]) if asked_for else (delay, []))

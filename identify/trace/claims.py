@@ -19,13 +19,17 @@ WORSE = 1.25  # times the error on held-out runs with fewer effects: as noise al
 WORSE_P = 0.05  # … and any worse, where noise leaves as much as that by so small a chance
 ASTRAY = 3.0  # times the declared model's error on held-out runs, beyond which a spread hides one
 MUCH = 30.0  # χ²/dof that a law leaves, or pairs, beyond which they are not near the data
+IDLE_P = 0.01  # chance of what an extension gains, above which the data do not ask for it
 NO_CHANCE = 300.0  # χ²/dof that no law of a few numbers takes up to the noise by luck
 
 
 def claimed(good: Sequence[Tried], others: Sequence[Tried]) -> tuple[Tried, list[Tried]]:
     """The best of what explains the data by values, and its rivals among `others`. Which is best
-    the fitted runs say; one that all runs make far likelier takes its place."""
+    the fitted runs say; what it extends takes its place where that does as well but for luck
+    (68029, a delay claimed as one that is spread), and one that all runs make far likelier."""
     best = best_form(good)
+    plainer = [t for t in good if _extends(best, t) and _idle(best, t)]
+    best = best_form(plainer or [best])
     found = rivals(best, others)
     likelier = [t for t in found if any(t is g for g in good) and _less_likely(t, best) < -EVIDENCE]
     if likelier:
@@ -138,6 +142,14 @@ def _extends(t: Tried, best: Tried) -> bool:
     """Whether `t` is `best` with an extension that the data do not ask for."""
     general = {n for e in t.effects for n in e.generalises}
     return t.fit.theta.size > best.fit.theta.size and best.parts <= t.parts | general
+
+
+def _idle(t: Tried, plainer: Tried) -> bool:
+    """Whether what a law has more than a plainer one gains no more than that would by luck."""
+    if t.spread is not None or plainer.spread is not None:
+        return False  # their likelihoods decide
+    freedom = t.fit.theta.size - plainer.fit.theta.size
+    return chi2_tail(plainer.chi2_of_all - t.chi2_of_all, freedom) > IDLE_P
 
 
 def gain_p(gain: float, t: Tried, without: Fit) -> float:
