@@ -460,3 +460,24 @@ def test_two_laws_of_one_flame(tmp_path: Path) -> None:
     good = [t for t in found.tried if t.explains]
     assert ("flame_delay", "flame_dynamics") in {t.key for t in good}
     assert best_form(good).key == ("flame_dynamics", "flame_dynamics")
+
+
+@pytest.mark.slow
+def test_several_declared_modes_are_sought_wherever_they_are(tmp_path: Path) -> None:
+    """Of three modes, one lies at 1.8 and one at 3.3 times the free frequency. From the usual
+    placements a microphone's lag and a speaker that compresses led to other ones (68028)."""
+    effects = [
+        make_effect("channel_mismatch/lowpass", {"lowpass_hz": 7468.0}),
+        make_effect("actuator_nonlinearity/compression", {"cubic_per_v2": 0.01016}),
+    ]
+    rig = random_rig(68028, noise_db=(30.0, 80.0), coloured=True, modes=(1, 2, 2, 2, 3))
+    conditions = {"forced": 7, "validation": 2, "cold": 0, "modes": 3}
+    ready = record(tmp_path, 68028, rig, effects, **conditions)
+    base = start.fit_from_data(ready.structure, ready.data)
+    forms = [by_key(k) for k in ("actuator_nonlinearity:quadratic_cubic", "channel_mismatch:skew")]
+    quiet = InProcess(), lambda share, text: None
+    (t,) = pairs_from_afar(ready.structure, ready.data, base, forms, [], *quiet)
+    assert t.explains
+    truth = [m.frequency_hz for m in rig.plant.modes]
+    found = [t.fit.values[f"mode{i}.frequency_hz"] for i in (1, 2, 3)]
+    np.testing.assert_allclose(sorted(found), sorted(truth), rtol=0.01)

@@ -24,7 +24,8 @@ from identify.trace.stages import OF_MODES, likely_placements
 from identify.trace.tried import Tried, few_of_each, tried
 
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
-SIDE_BY_SIDE = 16  # starts of a pair without a further mode that are led on
+SIDE_BY_SIDE = 16  # starts of a pair without a further mode that are led on …
+ANYWHERE = 64  # … and with several declared modes beside the one that sings
 NEARER = 40  # pairs that come to the second stage …
 NEAREST = 6  # … and that are refitted in full
 BEST_SINGLES = 3  # whose forms stand for their effects too
@@ -96,9 +97,12 @@ def pairs_from_afar(
     fit, which sizes of effects lean on."""
     forms = representatives(available, singles)
     rough, known = data.coarse(), known_sizes(data, base)
-    placements = likely_placements(structure, rough)
+    others = structure.mode_count - 1
+    # several trade off each other where even one effect is lacking: wherever they may be
+    afield = others > 1
+    placements = dense_placements(others) if afield else likely_placements(structure, rough)
     pairs = [
-        _Pair(structure, both, data, rough, known, placements)
+        _Pair(structure, both, data, rough, known, tuple(placements))
         for both in combinations(forms, 2)
         if both[0].name != both[1].name
     ]
@@ -144,7 +148,8 @@ def _lead(pair: _Pair) -> _Led:
     else:
         each = (e.starts(pair.known) for e in pair.effects)
         rows = [(*first, *second) for first, second in product(*each)]
-        placements, many = pair.placements, SIDE_BY_SIDE
+        placements = pair.placements
+        many = ANYWHERE if pair.plain.mode_count > 2 else SIDE_BY_SIDE
     starts = signed_starts(sought, pair.rough, rows, placements)[:many]
     # most of them fall behind at once
     ahead = polish(sought, pair.rough, starts, (FIRST,), 2)[: max(6, many // 4)]
