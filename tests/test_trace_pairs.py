@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from identify import balance, start, trace
+from identify.dataset import Dataset
+from identify.effect import Effect
 from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
@@ -14,7 +16,7 @@ from identify.structure import MODAL, Structure
 from identify.trace import law_steps
 from identify.trace.contesting import DOUBT, one_more
 from identify.trace.contests import NEAR, varied
-from identify.trace.exchange import joins
+from identify.trace.exchange import forms_in_place, joins
 from identify.trace.fewer import with_fewer
 from identify.trace.foreseen import foreseen
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
@@ -481,3 +483,53 @@ def test_several_declared_modes_are_sought_wherever_they_are(tmp_path: Path) -> 
     truth = [m.frequency_hz for m in rig.plant.modes]
     found = [t.fit.values[f"mode{i}.frequency_hz"] for i in (1, 2, 3)]
     np.testing.assert_allclose(sorted(found), sorted(truth), rtol=0.01)
+
+
+def of_modes(key: str, count: int) -> Effect:
+    return next(e for e in CATALOGUE if e.key == key and e.mode_count == count)
+
+
+def test_beside_a_further_mode_a_form_has_a_share_of_that_too() -> None:
+    """A loss at the end with shares of the two declared modes left out the third (68072)."""
+    mode = by_key("acoustic_mode:mode")
+    two, three = (of_modes("nonlinear_damping:quadratic_end", n) for n in (2, 3))
+    structure = Structure(2)
+    fit = replace(fitted(20, 14.0), structure=structure.with_effects(mode, two))
+    t = replace(tried_as(fit, mode.key), effects=(mode, two), fit_p=0.0)
+    found = forms_in_place(t, Dataset((), (), 0.0), [two, three], [t.key_of_forms])
+    assert [(kept, old, form) for _, kept, old, form, _ in found] == [((mode,), two, three)]
+    alone = replace(t, effects=(two,), fit=replace(fit, structure=structure.with_effects(two)))
+    assert forms_in_place(alone, Dataset((), (), 0.0), [two, three], []) == []
+
+
+def test_a_loss_at_the_end_starts_as_what_it_had_been_taken_for() -> None:
+    """Of the singing mode alone: nothing of the others there. Of all alike: as much of each."""
+    end = of_modes("nonlinear_damping:quadratic_end", 3)
+    both = of_modes("nonlinear_damping:quadratic_cubic_end", 3)
+    values = {"nonlinear_damping.coefficient": 4.0}
+    alone, alike = (by_key(f"nonlinear_damping:quadratic{x}") for x in ("_mode", ""))
+    assert end.starts_from(alone, values) == [(4.0, 0.0, 0.0, 0.0, 0.0)]
+    assert end.starts_from(alike, values) == [(4.0, 1.0, 1.0, 1.0, 1.0)]
+    assert both.starts_from(alone, values) == [(4.0, 0.0, 0.0, 0.0, 0.0, 0.0)]
+    two = {**values, "nonlinear_damping.end_ratio2": -0.8, "nonlinear_damping.return_ratio2": 2.0}
+    assert end.starts_from(of_modes("nonlinear_damping:quadratic_end", 2), two) == [
+        (4.0, -0.8, 2.0, 1.0, 1.0)
+    ]
+    assert end.starts_from(by_key("nonlinear_damping:cubic_mode"), values) == []
+
+
+@pytest.mark.slow
+def test_a_loss_at_the_end_beside_a_further_mode(tmp_path: Path) -> None:
+    shape = {"frequency_hz": 464.58, "damping": 0.01607}
+    residues = {"flame_residue_ratio": 0.6755, "speaker_residue_ratio": -0.6755}
+    effects = [
+        make_effect("acoustic_mode", {**shape, **residues}),
+        make_effect("nonlinear_damping/quadratic", {"quadratic_per_m": 2.2067}),
+    ]
+    rig = random_rig(68072, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    ready = record(tmp_path, 68072, rig, effects, forced=7, validation=2)
+    base = start.fit_from_data(ready.structure, ready.data)
+    forms = [e for e in CATALOGUE if e.name == "nonlinear_damping" or e.key == "acoustic_mode:mode"]
+    found = trace.search(ready.structure, ready.data, base, catalogue=forms, depth=2)
+    best = best_form([t for t in found.tried if t.explains])
+    assert best.key == ("acoustic_mode", "nonlinear_damping")

@@ -267,12 +267,16 @@ class NonlinearDamping(Effect):
         return [(*sizes, *np.repeat(q, 2).tolist()) for q in signs]
 
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
-        """The sum starts from either law, wherever that acts."""
-        if not self.refines:
+        """The sum starts from either law, wherever that acts; a law at another place from one of
+        all modes, or of the singing mode alone, for which the others are nothing there."""
+        if not isinstance(other, NonlinearDamping) or not (self.refines or self.ratios):
             return super().starts_from(other, values)
-        known = {q.unit: values[q.name] for q in other.parameters if q.unit != "1"}
+        if not (self.refines or set(self.laws) <= set(other.laws)):
+            return []
+        known = {q.unit: values[q.name] for q in other.own}
         sizes = [known.get(q.unit, 0.0) for q in self.own]
-        return [(*sizes, *(values.get(q.name, 1.0) for q in self.ratios))]
+        share = 0.0 if other.mode_only else 1.0
+        return [(*sizes, *(values.get(q.name, share) for q in self.ratios))]
 
     def neutral(self) -> tuple[float, ...]:
         return (*(0.0 for _ in self.own), *(1.0 for _ in self.ratios))

@@ -90,7 +90,7 @@ def forms_in_place(
     t: Tried, data: Dataset, available: Sequence[Effect], done: Collection[tuple[str, ...]]
 ) -> list[Exchange]:
     """Each effect of `t` against each other form of it that may stand there, but for what (by
-    forms) is `done`."""
+    forms) is `done`; and against its own form for the modes too that effects beside it bring."""
     out: list[Exchange] = []
     for e in t.effects:
         kept = tuple(o for o in t.effects if o is not e)
@@ -98,12 +98,22 @@ def forms_in_place(
             (t, kept, e, form, data)
             for form in available
             if form.name == e.name
-            and form.key != e.key
             and suits(form, t.fit.structure, kept)
             and joins(form, kept)
-            and key_of_forms((*kept, form)) not in done
+            and (_for_more_modes(form, e) or _not_done(form, e, kept, done))
         ]
     return out
+
+
+def _not_done(
+    form: Effect, old: Effect, kept: Sequence[Effect], done: Collection[tuple[str, ...]]
+) -> bool:
+    return form.key != old.key and key_of_forms((*kept, form)) not in done
+
+
+def _for_more_modes(form: Effect, old: Effect) -> bool:
+    """Whether it is the same form, with a share of more modes."""
+    return form.key == old.key and (form.mode_count or 0) > (old.mode_count or 0) > 0
 
 
 def exchanged(items: Sequence[Exchange], data: Dataset, run: Executor) -> list[Tried]:

@@ -33,7 +33,8 @@ class UnderWay:
     run: Executor
     report: Progress
     available: tuple[Effect, ...]
-    fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them
+    fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them …
+    as_well: tuple[Effect, ...]  # … and those of which there is one for the declared modes as well
     scatters: tuple[Scatter, ...]
     until: float = np.inf
     left_out: bool = False  # a step, for want of time
@@ -61,7 +62,7 @@ class UnderWay:
     @property
     def forms(self) -> tuple[Effect, ...]:
         """All forms, beside whatever they may stand."""
-        return (*self.available, *self.fuller)
+        return (*self.available, *self.fuller, *self.as_well)
 
     @property
     def explaining(self) -> list[Tried]:
