@@ -32,7 +32,7 @@ from identify.parameters import Estimate
 from identify.randomness import law_in
 from identify.start import distant_starts
 from identify.structure import Structure
-from identify.wander import likelier
+from identify.wander import LARGEST, SMALLEST, likelier
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
@@ -43,7 +43,6 @@ SQUARED = " squared"
 TREND_P = 0.003  # a rank correlation less probable than this is a law, not chance
 NOTHING = "no run deviates"  # an objection
 ONE_RUN = 0.9  # share of all deviation that a single run may hold, whatever their number
-SMALLEST = 1e-8
 UPPER = 2.0  # standard errors of ln σ that held-out runs may lie beyond the estimate
 HOPELESS = 5.0  # χ² a residual beyond which further rounds, or less noise, mend nothing …
 FAR = 30.0  # … and at first, when σ is no more than a guess
@@ -315,7 +314,7 @@ def _sizes(rows: Sequence[_Rows], start: FloatArray) -> FloatArray:
     from scipy import optimize  # a third of a second that only a spread costs
 
     def deviance(logs: FloatArray) -> float:
-        return _deviance(rows, np.exp(np.clip(logs, np.log(SMALLEST), 0.0)))
+        return _deviance(rows, np.exp(np.clip(logs, np.log(SMALLEST), np.log(LARGEST))))
 
     starts = [np.log(np.maximum(start, 1e-5)), np.full(start.size, np.log(1e-3))]
     found = [
@@ -328,7 +327,7 @@ def _sizes(rows: Sequence[_Rows], start: FloatArray) -> FloatArray:
         for s in starts
     ]
     best = min(found, key=lambda f: float(f.fun))
-    return np.asarray(np.exp(np.clip(best.x, np.log(SMALLEST), 0.0)))
+    return np.asarray(np.exp(np.clip(best.x, np.log(SMALLEST), np.log(LARGEST))))
 
 
 def _relative_errors(rows: Sequence[_Rows], sizes: FloatArray) -> FloatArray:

@@ -20,7 +20,7 @@ from identify.fit import profiled
 
 FloatArray = npt.NDArray[np.float64]
 
-FINEST, COARSEST = 1e-8, 1.0  # σ of a ratio's logarithm, at the end of the campaign
+SMALLEST, LARGEST = 1e-8, 1.0  # σ of a ratio's logarithm that is looked at
 STEPS = 60  # of ln σ in between, and as many about the best of these
 
 
@@ -63,7 +63,7 @@ class _Loaded:
 
     def least(self) -> float:
         """χ² + ln det V where σ² is the likeliest by its restricted likelihood."""
-        low, high = np.log([FINEST, COARSEST])
+        low, high = np.log([SMALLEST, LARGEST])
         found = []
         for _ in range(2):
             tried = np.linspace(low, high, STEPS)

@@ -145,7 +145,7 @@ def searching(
     """A search under way from there, on data of which nothing is looked at."""
     none = Dataset((), (), 0.0)
     return UnderWay(
-        base.structure, none, base, InProcess(), report, tuple(available), (), (), tuple(scatters)
+        base.structure, none, base, InProcess(), report, tuple(available), (), tuple(scatters)
     )
 
 

@@ -4,7 +4,7 @@ A search grows sets one effect at a time and drops what falls behind. Before one
 claimed, what might do as well from where it ended is tried.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -182,19 +182,31 @@ def at_the_same_place(
     laws = [t for t in tries if t.adequate and t.spread is None]
     best = [best_form(good) for good in (explaining, laws) if good]
     done = {t.key_of_forms for t in tries if t.adequate}
-    items = [
+    items: list[Exchange] = []
+    for t in first_of_each(best, lambda t: t.key_of_forms).values():
+        for old in t.effects:
+            near = [e for e in available if _may_stand_for(e, old, t)]
+            items += _in_the_place(t, old, data, near, done)
+    return exchanged(items, data, run)
+
+
+def _in_the_place(
+    t: Tried,
+    old: Effect,
+    data: Dataset,
+    available: Sequence[Effect],
+    done: Collection[tuple[str, ...]],
+) -> list[Exchange]:
+    """Other effects against `old`, one of those of `t`, but for what (by forms) is `done`."""
+    kept = tuple(o for o in t.effects if o is not old)
+    return [
         (t, kept, old, e, data)
-        for t in first_of_each(best, lambda t: t.key_of_forms).values()
-        for old in t.effects
-        for kept in [tuple(o for o in t.effects if o is not old)]
         for e in available
-        if _may_stand_for(e, old, t)
-        and e.name != old.name
+        if e.name != old.name
         and joins(e, kept)
         and not e.refines
         and key_of_forms((*kept, e)) not in done
     ]
-    return exchanged(items, data, run)
 
 
 def _may_stand_for(e: Effect, old: Effect, t: Tried) -> bool:
@@ -232,7 +244,9 @@ def in_their_places(
     for kept in [*combinations(best.effects, len(best.effects) - 1), ()]:
         base = with_fewer(best, kept, data) if kept else part_of(best, (), data)
         if kept and not base.chi2_per_dof < GROSS:  # no place to start from
-            out += _from_the_end(best, kept, data, available, run, tries)
+            (old,) = (e for e in best.effects if e not in kept)
+            done = {t.key_of_forms for t in tries if t.adequate}
+            out += exchanged(_in_the_place(best, old, data, available, done), data, run)
             continue
         if not np.isfinite(base.chi2):
             continue
@@ -245,25 +259,3 @@ def in_their_places(
             progress=lambda share, text: report(0.95 + 0.05 * share, text),
         )  # fmt: skip
     return [eliminate(t, data) if t.explains else t for t in out]
-
-
-def _from_the_end(
-    t: Tried,
-    kept: tuple[Effect, ...],
-    data: Dataset,
-    available: Sequence[Effect],
-    run: Executor,
-    tries: Sequence[Tried],
-) -> list[Tried]:
-    """Other effects beside those `kept` of `t`, in the place of the one that is not."""
-    (old,) = (e for e in t.effects if e not in kept)
-    done = {o.key_of_forms for o in tries if o.adequate}
-    others = [
-        (t, kept, old, e, data)
-        for e in available
-        if e.name != old.name
-        and joins(e, kept)
-        and not e.refines
-        and key_of_forms((*kept, e)) not in done
-    ]
-    return exchanged(others, data, run)

@@ -100,20 +100,18 @@ def forms_in_place(
             if form.name == e.name
             and suits(form, t.fit.structure, kept)
             and joins(form, kept)
-            and (_for_more_modes(form, e) or _not_done(form, e, kept, done))
+            and (
+                _for_more_modes(form, e)
+                if form.key == e.key
+                else key_of_forms((*kept, form)) not in done
+            )
         ]
     return out
 
 
-def _not_done(
-    form: Effect, old: Effect, kept: Sequence[Effect], done: Collection[tuple[str, ...]]
-) -> bool:
-    return form.key != old.key and key_of_forms((*kept, form)) not in done
-
-
 def _for_more_modes(form: Effect, old: Effect) -> bool:
-    """Whether it is the same form, with a share of more modes."""
-    return form.key == old.key and (form.mode_count or 0) > (old.mode_count or 0) > 0
+    """Whether the same form has a share of more modes than it had."""
+    return (form.mode_count or 0) > (old.mode_count or 0) > 0
 
 
 def exchanged(items: Sequence[Exchange], data: Dataset, run: Executor) -> list[Tried]:

@@ -101,7 +101,7 @@ def grow(going: UnderWay, parents: Sequence[Tried], afar: Sequence[Tried] = ()) 
         going.extended[parent.key_of_forms] = parent.fit.chi2
         rest = [
             e
-            for e in (*going.apart, *going.fuller)
+            for e in (*going.apart, *going.only_fuller)
             if joins(e, parent.effects) and suits(e, going.structure, parent.effects)
         ]
         grown += try_effects(

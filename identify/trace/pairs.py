@@ -97,12 +97,9 @@ def pairs_from_afar(
     fit, which sizes of effects lean on."""
     forms = representatives(available, singles)
     rough, known = data.coarse(), known_sizes(data, base)
-    others = structure.mode_count - 1
-    # several trade off each other where even one effect is lacking: wherever they may be
-    afield = others > 1
-    placements = dense_placements(others) if afield else likely_placements(structure, rough)
+    placements = likely_placements(structure, rough)
     pairs = [
-        _Pair(structure, both, data, rough, known, tuple(placements))
+        _Pair(structure, both, data, rough, known, placements)
         for both in combinations(forms, 2)
         if both[0].name != both[1].name
     ]
@@ -148,8 +145,9 @@ def _lead(pair: _Pair) -> _Led:
     else:
         each = (e.starts(pair.known) for e in pair.effects)
         rows = [(*first, *second) for first, second in product(*each)]
-        placements = pair.placements
-        many = ANYWHERE if pair.plain.mode_count > 2 else SIDE_BY_SIDE
+        placements, many = pair.placements, SIDE_BY_SIDE
+        if pair.plain.mode_count > 2:  # several others trade off each other: wherever they may be
+            placements, many = tuple(dense_placements(pair.plain.mode_count - 1)), ANYWHERE
     starts = signed_starts(sought, pair.rough, rows, placements)[:many]
     # most of them fall behind at once
     ahead = polish(sought, pair.rough, starts, (FIRST,), 2)[: max(6, many // 4)]

@@ -77,7 +77,7 @@ def search(
         executor or InProcess(),
         progress or (lambda share, text: None),
         tuple(e for e in catalogue if usable(e, data, structure)),
-        *_fuller(catalogue, data, structure),
+        _fuller(catalogue, data, structure),
         tuple(e for e in catalogue if isinstance(e, Scatter)),
         until,
     )
@@ -166,18 +166,11 @@ def refitted(tries: Sequence[Tried], data: Dataset) -> list[Tried]:
     return sorted(found, key=misfit)
 
 
-def _fuller(
-    catalogue: Sequence[Effect], data: Dataset, structure: Structure
-) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
-    """Forms for one mode or two more than declared: those that are not there for the declared ones,
-    and those that are."""
-    known = {e.key for e in catalogue if usable(e, data, structure)}
-    new: list[Effect] = []
+def _fuller(catalogue: Sequence[Effect], data: Dataset, structure: Structure) -> tuple[Effect, ...]:
+    """Forms for one mode or two more than declared."""
+    out: list[Effect] = []
     for added in (1, 2):
         more = replace(structure, mode_count=structure.mode_count + added)
-        found = [e for e in catalogue if e.mode_count is not None and usable(e, data, more)]
-        new += [e for e in found if not e.refines]
-    return (
-        tuple(e for e in new if e.key not in known),
-        tuple(e for e in new if e.key in known),
-    )
+        found = (e for e in catalogue if e.mode_count is not None and usable(e, data, more))
+        out += [e for e in found if not e.refines]
+    return tuple(out)

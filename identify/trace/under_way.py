@@ -33,8 +33,7 @@ class UnderWay:
     run: Executor
     report: Progress
     available: tuple[Effect, ...]
-    fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them …
-    as_well: tuple[Effect, ...]  # … and those of which there is one for the declared modes as well
+    fuller: tuple[Effect, ...]  # forms for more modes, beside an effect that brings them
     scatters: tuple[Scatter, ...]
     until: float = np.inf
     left_out: bool = False  # a step, for want of time
@@ -62,7 +61,13 @@ class UnderWay:
     @property
     def forms(self) -> tuple[Effect, ...]:
         """All forms, beside whatever they may stand."""
-        return (*self.available, *self.fuller, *self.as_well)
+        return (*self.available, *self.fuller)
+
+    @property
+    def only_fuller(self) -> list[Effect]:
+        """Forms for more modes of which there is none for the declared ones."""
+        known = {e.key for e in self.available}
+        return [e for e in self.fuller if e.key not in known]
 
     @property
     def explaining(self) -> list[Tried]:
