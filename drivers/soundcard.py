@@ -40,6 +40,9 @@ POLL_S = 0.002  # how often a waiting `read` looks; the callback may not wake an
 DRY = 2.0  # output latencies without a callback after which the output has certainly played out
 HELD_BACK_S = 0.1  # a sound server may hold more than its latency says: ramps were cut without it
 STALL_S = 1.0  # a stream without a callback for so long is lost (longest buffers are ~0.2 s)
+# PortAudio 19.6 gives up an ALSA stream whose input overruns before it first looks: under load a
+# tenth of all starts. Nothing was recorded or played by then, so it may begin again.
+STARTS = 5
 
 
 @dataclass
@@ -107,9 +110,26 @@ class SoundCardRig:
     # -- input -----------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Open the stream and begin; a second call while running is a `SettingError`."""
+        """Open the stream and wait for its first frames, at most a second.
+
+        A second call while running is a `SettingError`; `DeviceLost` if the stream ends before its
+        first frame however often it is begun.
+        """
         if self._stream is not None:
             raise SettingError(f"{self.name}: start() while running; stop() first")
+        for _ in range(STARTS):
+            stream = self._stream = self._open()
+            if self._begins(stream):
+                return
+            self._stream = None
+            self._discard(stream)
+        raise DeviceLost(
+            f"{self.name}: device lost: the audio stream of {self._input.name!r}/"
+            f"{self._output.name!r} ended before its first frame, {STARTS} times"
+        )
+
+    def _open(self) -> _Stream:
+        """A new stream with a ring of its own, started."""
         settings = self.settings
         ring = Ring(round(settings.ring_s * settings.sample_rate_hz), settings.input_channels)
         callback = AudioCallback(
@@ -158,7 +178,15 @@ class SoundCardRig:
         except BaseException:
             self._discard(stream)
             raise
-        self._stream = stream
+        return stream
+
+    def _begins(self, stream: _Stream) -> bool:
+        """Whether `stream` does not end before its first frame; silence is for `read` to judge."""
+        callback = stream.callback
+        deadline = time.monotonic() + STALL_S
+        while callback.started_s is None and not stream.finished and time.monotonic() < deadline:
+            time.sleep(POLL_S)
+        return not stream.finished or callback.started_s is not None or callback.failed is not None
 
     def read(self, frames: int, timeout_s: float = 5.0) -> Block:
         """Next `frames` frames in volts; fewer only right before lost ones."""

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.audio_devices import find_audio_device, rescan
-from drivers.errors import DeviceNotFound, SettingError
+from drivers.audio_callback import AudioCallback
+from drivers.audio_devices import find_audio_device, portaudio, rescan
+from drivers.errors import DeviceLost, DeviceNotFound, SettingError
 from drivers.soundcard import SoundCardRig
 from drivers.types import OutputLimits, Tone
 from tests.contract import RigContract
@@ -71,6 +72,47 @@ class TestSelection:
     def test_limits_beyond_full_scale_are_refused(self) -> None:
         with pytest.raises(SettingError, match=r"max_amplitude_v=2\.5"):
             SoundCardRig(SETTINGS, OutputLimits(2.5))
+
+
+@pytest.mark.component("PortAudio")
+@pytest.mark.component("PulseAudio")
+@pytest.mark.usefixtures("loop")
+class TestStart:
+    """PortAudio may end an ALSA stream before its first callback; here its first callbacks do."""
+
+    def ending(self, monkeypatch: pytest.MonkeyPatch, times: int) -> list[int]:
+        served, ended = AudioCallback.__call__, [0]
+
+        def ends(self: AudioCallback, *given: Any) -> None:
+            if ended[0] < times:
+                ended[0] += 1
+                raise portaudio().CallbackAbort
+            served(self, *given)
+
+        monkeypatch.setattr(AudioCallback, "__call__", ends)
+        return ended
+
+    def test_a_stream_that_ends_before_its_first_frame_begins_again(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        ended = self.ending(monkeypatch, 2)
+        with SoundCardRig(dataclasses.replace(SETTINGS, latency_s=0.1), LIMITS) as rig:
+            rig.start()
+            assert rig.read(2400).frames == 2400
+            assert rig.status().running
+        assert ended == [2]
+
+    def test_one_that_always_does_is_lost_and_may_be_started_later(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        with SoundCardRig(dataclasses.replace(SETTINGS, latency_s=0.1), LIMITS) as rig:
+            with monkeypatch.context() as patch:
+                self.ending(patch, 1000)
+                with pytest.raises(DeviceLost, match="before its first frame, 5 times"):
+                    rig.start()
+            assert not rig.status().running
+            rig.start()
+            assert rig.read(2400).frames == 2400
 
 
 @pytest.mark.component("PortAudio")
