@@ -45,7 +45,7 @@ from simulated_rig import build_config
 from simulated_rig.campaigns import SimulatedCampaign, simulate_campaign
 from simulated_rig.config import RigConfig
 from simulated_rig.effects import EFFECTS
-from simulated_rig.random_rigs import random_campaign, random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_campaign, random_rig
 from simulated_rig.seal import SealedEffect
 
 Truth = dict[str, float]
@@ -132,10 +132,9 @@ def any_rig(
     volts = float(10 ** np.random.default_rng([seed, 72]).uniform(*TURBULENCE))
     rig = random_rig(
         seed,
-        noise_db=(30.0, 80.0),
         coloured=bool(rng.uniform() < 0.3),
         turbulence_v=volts if turbulent else 0.0,
-        modes=(1, 2, 2, 2, 3),
+        modes=MOST_TWO,
     )
     effects = []
     if mode != "clean":

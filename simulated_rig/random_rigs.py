@@ -22,6 +22,7 @@ from simulated_rig.statespace import assemble
 
 FLAME_M = 0.762
 ATTEMPTS = 60
+MOST_TWO = (1, 2, 2, 2, 3)  # numbers of modes to choose from, as laboratories declare
 
 
 def closed_loop_poles(plant: Plant, gain: float) -> np.ndarray:

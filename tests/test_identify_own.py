@@ -17,7 +17,7 @@ from simulated_rig import build_config
 from simulated_rig.config import Drift
 from simulated_rig.drift import change_at
 from simulated_rig.effects import make_effect
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import record, thesis_campaign
 
 SEED = 5
@@ -125,7 +125,7 @@ def test_a_spread_is_known_no_better_than_so_few_runs_tell(tmp_path: Path) -> No
     """A thousand times the noise: θ knows some directions a million times better than others, and
     what they absorb of the deviations must not be lost among the digits."""
     size = 0.00257
-    rig = random_rig(6013, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(6013, modes=MOST_TWO)
     scatter = make_effect("drive_scatter", {"gain_rms": size, "phase_rms_rad": size})
     ready = record(tmp_path, 6013, rig, [scatter], forced=9, validation=3, modes=1)
     base = start.fit_from_data(ready.structure, ready.data)
@@ -143,7 +143,7 @@ def test_a_spread_is_known_no_better_than_so_few_runs_tell(tmp_path: Path) -> No
 def test_a_spread_guessed_too_wide_leads_nothing_astray(tmp_path: Path) -> None:
     """A hundred times too wide a guess let every run deviate until the mode that sings had no
     damping left, and no descent came back from there (54158)."""
-    rig = random_rig(54158, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(54158, modes=MOST_TWO)
     effects = [
         make_effect("parameter_drift/frequency_walk", {"frequency_walk": 1.4169e-4}),
         make_effect("actuator_dynamics/voice_coil", {"pole_hz": 712.13}),
@@ -167,7 +167,7 @@ def test_a_spread_guessed_too_wide_leads_nothing_astray(tmp_path: Path) -> None:
 def test_that_one_run_of_few_deviates_may_be_luck(tmp_path: Path) -> None:
     """Of eight runs one has nine tenths of all phase (53039): seldom, and no more."""
     size = 0.00955810219346193
-    rig = random_rig(53039, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(53039, modes=MOST_TWO)
     scatter = make_effect("drive_scatter", {"gain_rms": size, "phase_rms_rad": size})
     ready = record(tmp_path, 53039, rig, [scatter], forced=7, validation=2, cold=1, modes=3)
     base = start.fit_from_data(ready.structure, ready.data)

@@ -28,7 +28,7 @@ from identify.trace import search
 from identify.trace.places import shaped, whereabouts
 from simulated_rig import build_config
 from simulated_rig.campaigns import simulate_campaign, write_campaign
-from simulated_rig.random_rigs import random_campaign, random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_campaign, random_rig
 from tests.identify_rig import POLE, FloatArray, true_values, velocity
 from tests.trace_material import record
 
@@ -242,7 +242,7 @@ def test_unusable_recordings_are_refused_by_name(change, words) -> None:
 def test_few_runs_of_a_quiet_rig_do_not_leave_a_mode_at_the_wrong_place(
     tmp_path: Path, seed: int, forced: int, modes: int
 ) -> None:
-    drawn = random_rig(seed, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    drawn = random_rig(seed, modes=MOST_TWO)
     rig, plan = random_campaign(seed, drawn, forced=forced, validation=1)
     write_campaign(simulate_campaign(rig, plan, seed, declared_modes=modes), tmp_path)
     ready = prepare(load_campaign(open_campaign(tmp_path)))
@@ -256,7 +256,7 @@ def test_few_runs_of_a_quiet_rig_do_not_leave_a_mode_at_the_wrong_place(
 
 def test_of_several_minima_of_few_runs_the_one_that_suits_the_held_out_run(tmp_path: Path) -> None:
     """Five runs for fifteen parameters: the best of them is elsewhere than what all six share."""
-    rig = random_rig(20008, noise_db=(30.0, 80.0), coloured=True, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(20008, coloured=True, modes=MOST_TWO)
     ready = record(tmp_path, 20008, rig, [], forced=5, validation=1, modes=3)
     (held_out,) = ready.data.validation
 

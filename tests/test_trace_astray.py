@@ -30,7 +30,7 @@ from identify.trace.stages import slow_flow_starts
 from identify.trace.tried import tried
 from simulated_rig.campaigns import RecordedRun
 from simulated_rig.effects import make_effect
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.test_identify_balance import forced_conditions
 from tests.trace_material import (
     altered_campaign,
@@ -291,7 +291,7 @@ def test_what_the_fit_mostly_absorbs_starts_with_what_stands_for_it(tmp_path: Pa
         "flame_dynamics/second_time_scale",
         {"slow_share": 0.07758239957477514, "slow_pole_hz": 45.53000808951163},
     )
-    rig = random_rig(30866, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(30866, modes=MOST_TWO)
     ready = record(tmp_path, 30866, rig, [slow], forced=8, validation=2, modes=3)
     base = start.fit_from_data(ready.structure, ready.data)
     assert 3.0 < base.chi2_per_dof < 10.0
@@ -329,7 +329,7 @@ def test_an_effect_that_others_kept_from_its_refit(tmp_path: Path) -> None:
     """Thirteen forms come nearer at coarse noise than a gross loss of end and mouth, and are the
     first ones refitted: among them none explains the data. By itself it does."""
     loss = make_effect("nonlinear_damping/cubic", {"cubic_s_per_m2": 3.938})
-    rig = random_rig(30678, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(30678, modes=MOST_TWO)
     ready = record(tmp_path, 30678, rig, [loss], forced=7, validation=2)
     base = start.fit_from_data(ready.structure, ready.data)
     nearer = (
@@ -397,7 +397,7 @@ def test_another_mode_sings_than_the_first(tmp_path: Path) -> None:
     """A resonator splits the mode that sings: of the declared two, the second sings, and the
     descent crept along the valley of the first for thousands of steps (53016)."""
     size = {"frequency_hz": 143.05, "damping": 0.0204, "coupling": 0.0477}
-    rig = random_rig(53016, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(53016, modes=MOST_TWO)
     branch = make_effect("side_resonator", size)
     ready = record(tmp_path, 53016, rig, [branch], forced=10, validation=3)
     base = start.fit_from_data(ready.structure, ready.data)
@@ -495,7 +495,7 @@ def test_a_resonator_beside_the_singing_mode_at_its_own_frequency(tmp_path: Path
     """From afar the start above that frequency looks best, and leads to one that gives energy."""
     size = {"frequency_hz": 144.08, "damping": 0.0484, "coupling": 0.00112}
     branch = make_effect("side_resonator", size)
-    rig = random_rig(19028, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    rig = random_rig(19028, modes=MOST_TWO)
     ready = record(tmp_path, 19028, rig, [branch], forced=9, validation=3)
     base = start.fit_from_data(ready.structure, ready.data)
     assert base.chi2_per_dof > 1000
@@ -512,7 +512,7 @@ def test_a_resonator_beside_the_singing_mode_at_its_own_frequency(tmp_path: Path
 def test_a_strong_resonator_with_its_mouth_near_a_node_of_the_singing_mode(tmp_path: Path) -> None:
     """It feels mode 1 a sixtieth as much as mode 2, which it moves far."""
     size = {"frequency_hz": 408.2528, "damping": 0.025258, "coupling": 0.0206826}
-    rig = random_rig(19021, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    rig = random_rig(19021, modes=MOST_TWO)
     branch = make_effect("side_resonator", size)
     ready = record(tmp_path, 19021, rig, [branch], forced=10, validation=3)
     base = start.fit_from_data(ready.structure, ready.data)
@@ -530,7 +530,7 @@ def test_a_strong_resonator_with_its_mouth_near_a_node_of_the_singing_mode(tmp_p
 def test_a_resonator_felt_oppositely_by_the_second_mode(tmp_path: Path) -> None:
     """Its mouth lies where the two modes have opposite signs, between which no descent passes."""
     size = {"frequency_hz": 319.58, "damping": 0.031235, "coupling": 0.039238}
-    rig = random_rig(37147, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    rig = random_rig(37147, modes=MOST_TWO)
     effects = [make_effect("side_resonator", size)]
     ready = record(tmp_path, 37147, rig, effects, forced=10, validation=3)
     base = start.fit_from_data(ready.structure, ready.data)
@@ -662,7 +662,7 @@ def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Pat
     distortion makes: it leads nowhere. Of the placements of two further modes the right one comes
     fourth at coarse noise (59285)."""
     a2 = -0.0099134
-    rig = random_rig(59285, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(59285, modes=MOST_TWO)
     distorted = make_effect("actuator_nonlinearity/distortion", {"quadratic_per_v": a2})
     ready = record(tmp_path, 59285, rig, [distorted], forced=10, validation=3, modes=3)
     base = start.fit_from_data(ready.structure, ready.data)
@@ -683,7 +683,7 @@ def test_where_nothing_explains_each_effect_is_tried_from_afar_too(tmp_path: Pat
 def test_many_laws_follow_what_is_slight(tmp_path: Path) -> None:
     """A second time scale of the flame, which no candidate names, leaves 1.9 times the noise: a
     loss comes to the noise, and a free shape of the flame is far likelier (48030)."""
-    rig = random_rig(48030, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(48030, modes=MOST_TWO)
     slow = {"slow_share": 0.0467, "slow_pole_hz": 54.866}
     effect = make_effect("flame_dynamics/second_time_scale", slow)
     ready = record(tmp_path, 48030, rig, [effect], forced=7, validation=2)

@@ -23,7 +23,7 @@ from identify.trace.scores import chance_test
 from identify.trace.spreads import try_scatters
 from identify.trace.tried import tried
 from simulated_rig.effects import make_effect
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import (
     fitted,
     of_runs,
@@ -169,7 +169,7 @@ def test_a_law_and_chance_that_are_both_gross(tmp_path: Path) -> None:
         make_effect("actuator_nonlinearity/distortion", {"quadratic_per_v": -0.008}),
         make_effect("drive_scatter", {"gain_rms": 0.0026, "phase_rms_rad": 0.0026}),
     ]
-    rig = random_rig(6013, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(6013, modes=MOST_TWO)
     ready = record(tmp_path, 6013, rig, effects, forced=9, validation=3, modes=1)
     base = start.fit_from_data(ready.structure, ready.data)
     assert base.chi2_per_dof > 1e4

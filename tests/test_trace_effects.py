@@ -28,7 +28,7 @@ from identify.trace.to_the_end import settled
 from identify.trace.tried import tried
 from simulated_rig import build_config
 from simulated_rig.effects import make_effect
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import (
     campaign,
     fitted,
@@ -249,7 +249,7 @@ def test_what_stands_out_and_does_not_explain_keeps_none_from_a_start_afar(tmp_p
     ready = record(
         tmp_path,
         120,
-        random_rig(120, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3)),
+        random_rig(120, modes=MOST_TWO),
         [make_effect("actuator_dynamics/voice_coil", {"pole_hz": 1828.27})],
         forced=10,
         validation=3,

@@ -41,7 +41,7 @@ from simulated_rig.config import Drift, RigConfig
 from simulated_rig.drift import drifted
 from simulated_rig.effects import make_effect
 from simulated_rig.plant import Plant
-from simulated_rig.random_rigs import random_campaign, random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_campaign, random_rig
 from tests.test_identify_balance import forced_conditions
 from tests.trace_material import (
     Supposed,
@@ -664,7 +664,7 @@ def test_beside_chance_a_law_s_forms_start_from_where_it_ended(
 def test_what_wanders_is_sought_from_afar_where_a_fit_without_it_is_astray(tmp_path: Path) -> None:
     """A frequency that walks: with a fiftieth of each coefficient for noise the declared model is
     nearly right, in a minimum far from the truth (a walk beside a quintic law, 39012)."""
-    rig = random_rig(39012, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    rig = random_rig(39012, modes=MOST_TWO)
     made = [
         make_effect("parameter_drift/frequency_walk", {"frequency_walk": 0.002123}),
         make_effect("nonlinearity_shape/quintic", {"quintic_share": 0.0049021}),
@@ -686,7 +686,7 @@ def test_what_wanders_is_sought_from_afar_where_a_fit_without_it_is_astray(tmp_p
 def test_effects_are_sought_from_other_minima_of_the_declared_model_too(tmp_path: Path) -> None:
     """A gain of 1.3e-3 is made up for best by a mode that has gone to another's place, from where
     the gain leads nowhere; the next best minimum is the one that it was needed in (40024)."""
-    rig = random_rig(40024, noise_db=(30.0, 80.0), modes=(1, 2, 2, 2, 3))
+    rig = random_rig(40024, modes=MOST_TWO)
     made = [make_effect("channel_mismatch/gain", {"gain": 0.0013235641})]
     ready = record(tmp_path, 40024, rig, made, forced=7, validation=2, cold=1, modes=3)
     base = start.fit_from_data(ready.structure, ready.data)

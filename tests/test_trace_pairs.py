@@ -24,7 +24,7 @@ from identify.trace.places import within_a_place
 from identify.trace.restated import renamed
 from identify.trace.tried import best_form, tried
 from simulated_rig.effects import make_effect
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import (
     fitted,
     only,
@@ -454,7 +454,7 @@ def test_two_laws_of_one_flame(tmp_path: Path) -> None:
         make_effect("flame_dynamics/extra_pole", {"pole_hz": 905.4}),
         make_effect("flame_dynamics/distributed_delay", {"mean_delay_s": 2.195e-4}),
     ]
-    rig = random_rig(68051, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(68051, modes=MOST_TWO)
     ready = record(tmp_path, 68051, rig, effects, forced=7, validation=2)
     base = start.fit_from_data(ready.structure, ready.data)
     forms = [by_key("flame_delay"), *(e for e in CATALOGUE if e.name == "flame_dynamics")]
@@ -472,7 +472,7 @@ def test_several_declared_modes_are_sought_wherever_they_are(tmp_path: Path) -> 
         make_effect("channel_mismatch/lowpass", {"lowpass_hz": 7468.0}),
         make_effect("actuator_nonlinearity/compression", {"cubic_per_v2": 0.01016}),
     ]
-    rig = random_rig(68028, noise_db=(30.0, 80.0), coloured=True, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(68028, coloured=True, modes=MOST_TWO)
     conditions = {"forced": 7, "validation": 2, "cold": 0, "modes": 3}
     ready = record(tmp_path, 68028, rig, effects, **conditions)
     base = start.fit_from_data(ready.structure, ready.data)
@@ -526,7 +526,7 @@ def test_a_loss_at_the_end_beside_a_further_mode(tmp_path: Path) -> None:
         make_effect("acoustic_mode", {**shape, **residues}),
         make_effect("nonlinear_damping/quadratic", {"quadratic_per_m": 2.2067}),
     ]
-    rig = random_rig(68072, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(68072, modes=MOST_TWO)
     ready = record(tmp_path, 68072, rig, effects, forced=7, validation=2)
     base = start.fit_from_data(ready.structure, ready.data)
     forms = [e for e in CATALOGUE if e.name == "nonlinear_damping" or e.key == "acoustic_mode:mode"]

@@ -10,7 +10,7 @@ from identify.effects import by_key
 from identify.harmonics import Harmonics
 from identify.identification import DOUBT
 from simulated_rig.effects import make_effect
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import record
 
 
@@ -18,7 +18,7 @@ def test_another_mode_that_sings_in_one_run_hides_no_effect(tmp_path: Path) -> N
     """With the damping that falls, the second mode sings at -20.5 dB beside the forcing of one run,
     whose response is nine per cent off by that, at 80 dB of noise (48024)."""
     change = -0.0477
-    rig = random_rig(48024, noise_db=(30.0, 80.0), coloured=False, modes=(1, 2, 2, 2, 3))
+    rig = random_rig(48024, modes=MOST_TWO)
     drift = make_effect("parameter_drift/damping", {"damping_change": change})
     ready = record(tmp_path, 48024, rig, [drift], forced=10, validation=3)
     (run,) = ready.quality.doubted

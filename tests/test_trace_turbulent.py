@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import identify
-from simulated_rig.random_rigs import random_rig
+from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import record
 
 pytestmark = pytest.mark.no_cover
@@ -25,10 +25,9 @@ def test_noise_in_the_loop_is_no_effect(
 ) -> None:
     rig = random_rig(
         seed,
-        noise_db=(30.0, 80.0),
         coloured=coloured,
         turbulence_v=turbulence_v,
-        modes=(1, 2, 2, 2, 3),
+        modes=MOST_TWO,
     )
     modes = len(rig.plant.modes)
     ready = record(tmp_path, seed, rig, [], forced=forced, validation=3, modes=modes)
