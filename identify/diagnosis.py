@@ -239,7 +239,10 @@ class _Concluding:
         if chosen is not None and asks_for_shapes(chosen, self.base):
             # a spread takes up much, and so may laws: not where one does better that nobody knows
             tried = tuple(trace.against_chance(tried, self.pieces))
-            deviating = self.deviating(chosen) if chosen.spread else []
+            if chosen.spread:
+                deviating = self.deviating(chosen)
+            elif chosen.follows_runs:
+                deviating = self.deviating_runs
             contesting = [*self.pieces, *deviating]
             verdict, chosen, explanation = judge(found.declared, tried, self.data, contesting)
         flags = found.ready.quality.flags
@@ -260,7 +263,7 @@ class _Concluding:
             asked += trace.remembering(
                 found.ready.structure, self.data, self.base, self.run, self.placing
             )
-            asked += self.deviating()
+            asked += [] if deviating is self.deviating_runs else self.deviating_runs
             tried, asked = (
                 tuple(trace.unrivalled(tried, asked)),
                 trace.unrivalled(asked, tried),
@@ -287,8 +290,13 @@ class _Concluding:
             found.ready.structure, self.data, self.base, found.tried, self.run, self.placing
         )
 
-    def deviating(self, rivalled: Tried | None = None) -> list[Tried]:
+    @cached_property
+    def deviating_runs(self) -> list[Tried]:
         """Runs that each deviate at one place."""
+        return self.deviating()
+
+    def deviating(self, rivalled: Tried | None = None) -> list[Tried]:
+        """The same; as rivals of what explains the data, from where that has ended."""
         self.placing(1.0, "trying runs that deviate at each place")
         return trace.deviating(self.found.ready.structure, self.data, self.base, self.run, rivalled)
 

@@ -98,8 +98,13 @@ def judge(
     if good:
         nearest = trace.best_form(good)
         said = f"{nearest.words} comes near to the data, with no values: {nearest.fit.reason}."
-    elif any(trace.outdone(t, pieces) for t in near_it):
+    elif any(trace.outdone(t, [p for p in pieces if p.spread is None]) for t in near_it):
         said = "What comes near to the data is far less likely than a law that nobody here knows."
+    elif any(trace.outdone(t, pieces) for t in near_it):
+        said = (
+            "What comes near to the data is no likelier than chance that nobody here knows: its "
+            "numbers may follow runs that differ at random."
+        )
     elif near_it:
         said = (
             "What comes near to the data takes too little more of the misfit away than what has an "
@@ -140,9 +145,11 @@ def nearly(
     remain, or bad luck; another cause hardly.
     """
     best = next((t for t in ranked if len(t.effects) == 1 and t.spread is None), None)
-    if best is None or not best.fit.converged or best.fit.chi2_per_dof > 3.0:
-        return None
+    if best is None or best.explains or not best.fit.converged or best.fit.chi2_per_dof > 3.0:
+        return None  # what explains the data is claimed for that, or not at all
     excess = max(best.fit.chi2 - best.fit.dof, 0.0)
+    if base_chi2 < SLIGHT * best.fit.dof:
+        return None  # of so little, hardly anything is an empty trace
     empty = excess < 0.002 * (base_chi2 - best.fit.dof)
     if not (empty and (best.validation_error < 1.5 * floor or best.validation_p > LUCK)):
         return None

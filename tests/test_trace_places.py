@@ -238,3 +238,23 @@ def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     assert "forward" in found.whereabouts.likely
     monkeypatch.setattr(verdict, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
+
+
+@pytest.mark.slow
+def test_what_no_candidate_names_and_is_random_is_no_law_that_follows_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The flame's gain wanders within each run, little beside the noise (χ²/dof 1.2). Three numbers
+    of a cycle follow what differs from run to run; one of chance does as well."""
+    gain = {"modulation_rms": 0.0065, "corner_hz": 0.5506400742650892}
+    wander = {"flame_gain_modulation": gain}
+    recordings = thesis_campaign(tmp_path, 1207, wander, validation=3).campaign
+    cycle = [by_key("parameter_drift:flame_gain_cycle")]
+    found = identify.diagnose(recordings, catalogue=cycle)
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert "no likelier than chance" in found.explanation
+    assert found.whereabouts is not None
+    assert "flame" in found.whereabouts.likely
+    # uncontested, it would have been claimed
+    monkeypatch.setattr(trace.Tried, "follows_runs", False)
+    assert identify.diagnose(recordings, catalogue=cycle).verdict == "traced"

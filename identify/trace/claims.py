@@ -239,12 +239,16 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
 
 def _bettered(t: Tried, others: Sequence[Tried], by: float) -> bool:
     """Whether one of `others` is likelier `by` so much; a law than chance, with its numbers tuned
-    too."""
-    return any(
-        o.evidence < t.evidence - by
-        and (t.spread is None or o.spread is not None or _tuned_less(t, o) > by)
-        for o in others
-    )
+    too, and chance by that alone than a law that may have followed it, however little."""
+    for o in others:
+        if t.spread is None and o.spread is not None:
+            better = t.follows_runs and _tuned_less(o, t) < 0
+        else:
+            better = o.evidence < t.evidence - by
+            better &= t.spread is None or o.spread is not None or _tuned_less(t, o) > by
+        if better:
+            return True
+    return False
 
 
 def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
@@ -268,10 +272,10 @@ def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
 
 
 def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
-    """Whether a freely shaped piece is far likelier, complexity counted: then the cause is one that
-    nobody has named, and `t` only comes near to it. Chance at one place is asked so of chance at
-    another alone."""
-    good = [p for p in pieces if (p.adequate if p.spread is None else p.explains and t.spread)]
+    """Whether a freely shaped piece is far likelier, complexity counted, or chance at some place
+    than what follows the runs: then the cause is one that nobody has named, and `t` only comes near
+    to it."""
+    good = [p for p in pieces if (p.adequate if p.spread is None else p.explains)]
     return _bettered(t, good, by=EVIDENCE)
 
 

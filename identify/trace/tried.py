@@ -117,6 +117,12 @@ class Tried:
         return self.fit_p > LEFT_BESIDE_P and not self.validation_p < HELD_OUT_P
 
     @property
+    def follows_runs(self) -> bool:
+        """Whether it has numbers enough to follow runs that differ at random, one after the other:
+        a curve or a cycle in the course of the campaign."""
+        return any(e.location == "experiment" and len(e.parameters) > 1 for e in self.effects)
+
+    @property
     def has_values(self) -> bool:
         """Whether its fit came to an end; a spread's values are those of its likelihood."""
         return self.spread is not None or self.fit.ended
