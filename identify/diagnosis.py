@@ -39,7 +39,7 @@ from identify.structure import Structure
 from identify.trace import Cancelled, Tried
 from identify.trace.tried import best_by_name
 from identify.trace.tried import tried as as_tried
-from identify.verdict import DOUBTFUL, Declared, asks_for_shapes, judge
+from identify.verdict import DOUBTFUL, SLIGHT, Declared, asks_for_shapes, judge
 
 SHOWN = 12  # candidates in the report
 REFITTED = 6  # sets of effects that are fitted again where the data's covariances have changed
@@ -241,7 +241,7 @@ class _Concluding:
             tried = tuple(trace.against_chance(tried, self.pieces))
             if chosen.spread:
                 deviating = self.deviating(chosen)
-            elif chosen.follows_runs:
+            elif chosen.follows_runs or self.base.chi2_per_dof < SLIGHT:
                 deviating = self.deviating_runs
             contesting = [*self.pieces, *deviating]
             verdict, chosen, explanation = judge(found.declared, tried, self.data, contesting)

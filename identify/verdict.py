@@ -49,7 +49,12 @@ def judge(
     if not declared.significant:
         return "no_discrepancy", None, _not_contradicted(declared.fit)
     good = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
-    good = [t for t in good if not trace.outdone(t, pieces)]
+    shapes = [p for p in pieces if p.spread is None]
+    # a law that chance with a name may stand for is its rival, and no worse for chance without
+    named = any(t.spread is not None for t in good)
+    good = [
+        t for t in good if not trace.outdone(t, shapes if named and t.spread is None else pieces)
+    ]
     settled = [t for t in good if t.has_values]  # of these alone one is claimed
     if settled:
         spreads = [t for t in tried if t.spread is not None and not t.explains]
@@ -98,7 +103,7 @@ def judge(
     if good:
         nearest = trace.best_form(good)
         said = f"{nearest.words} comes near to the data, with no values: {nearest.fit.reason}."
-    elif any(trace.outdone(t, [p for p in pieces if p.spread is None]) for t in near_it):
+    elif any(trace.outdone(t, shapes) for t in near_it):
         said = "What comes near to the data is far less likely than a law that nobody here knows."
     elif any(trace.outdone(t, pieces) for t in near_it):
         said = (

@@ -239,10 +239,10 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
 
 def _bettered(t: Tried, others: Sequence[Tried], by: float) -> bool:
     """Whether one of `others` is likelier `by` so much; a law than chance, with its numbers tuned
-    too, and chance by that alone than a law that may have followed it, however little."""
+    too, and chance than a law by that alone, or however little than one that may follow it."""
     for o in others:
         if t.spread is None and o.spread is not None:
-            better = t.follows_runs and _tuned_less(o, t) < 0
+            better = _tuned_less(o, t) < (0.0 if t.follows_runs else -by)
         else:
             better = o.evidence < t.evidence - by
             better &= t.spread is None or o.spread is not None or _tuned_less(t, o) > by
@@ -272,9 +272,8 @@ def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
 
 
 def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
-    """Whether a freely shaped piece is far likelier, complexity counted, or chance at some place
-    than what follows the runs: then the cause is one that nobody has named, and `t` only comes near
-    to it."""
+    """Whether a freely shaped piece, or chance at some place, is far likelier, complexity counted:
+    then the cause is one that nobody has named, and `t` only comes near to it."""
     good = [p for p in pieces if (p.adequate if p.spread is None else p.explains)]
     return _bettered(t, good, by=EVIDENCE)
 
