@@ -241,7 +241,7 @@ class _Concluding:
             tried = tuple(trace.against_chance(tried, self.pieces))
             if chosen.spread:
                 deviating = self.deviating(chosen)
-            elif chosen.follows_runs or self.base.chi2_per_dof < SLIGHT:
+            elif self.base.chi2_per_dof < SLIGHT:
                 deviating = self.deviating_runs
             contesting = [*self.pieces, *deviating]
             verdict, chosen, explanation = judge(found.declared, tried, self.data, contesting)
