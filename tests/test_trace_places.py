@@ -280,3 +280,21 @@ def test_what_runs_that_differ_at_random_leave_is_no_law_of_a_slight_misfit(
     assert "flame" in found.whereabouts.likely
     monkeypatch.setattr(diagnosis, "SLIGHT", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
+
+
+@pytest.mark.slow
+def test_what_a_free_shape_outdoes_is_a_rival_still(tmp_path: Path) -> None:
+    """A weak side resonator, χ²/dof 2, that no candidate names. Of two other laws that differ by
+    less than 10, a free shape is likelier by more than that than one, and by less than the other:
+    which is no surer for that."""
+    branch = {
+        "frequency_hz": 150.918093306,
+        "damping": 0.0221717947957,
+        "coupling": 0.0119895995073,
+    }
+    rig = random_rig(49113, modes=MOST_TWO)
+    made = [make_effect("side_resonator", branch)]
+    recordings = record(tmp_path, 49113, rig, made, forced=8, validation=2).campaign
+    laws = [by_key("drive_pickup:velocity"), by_key("channel_mismatch:gain_phase")]
+    found = identify.diagnose(recordings, catalogue=laws)
+    assert found.verdict == "ambiguous", found.explanation
