@@ -51,17 +51,16 @@ def judge(
     every = [t for t in tried if t.explains and trace.accounts(t, declared.model, tried)]
     shapes = [p for p in pieces if p.spread is None]
     # a law that chance with a name may stand for is its rival, and no worse for chance without
-    named = any(t.spread is not None for t in every)
-    good = [
-        t for t in every if not trace.outdone(t, shapes if named and t.spread is None else pieces)
-    ]
+    laws = [t for t in every if t.spread is None]
+    against_laws = pieces if len(laws) == len(every) else shapes
+    good = [t for t in every if not trace.outdone(t, against_laws if t.spread is None else pieces)]
     settled = [t for t in good if t.has_values]  # of these alone one is claimed
     if settled:
         spreads = [t for t in tried if t.spread is not None and not t.explains]
         implausible = [t for t in tried if t.spread is None and t.adequate and not t.plausible]
         # of laws that differ little, one is not the surer for what is likelier than the other
-        laws = [t for t in every if t.spread is None and all(t is not g for g in good)]
-        best, others = trace.claimed(settled, [*good, *laws, *spreads, *implausible])
+        explaining = [*laws, *(t for t in good if t.spread is not None)]
+        best, others = trace.claimed(settled, [*explaining, *spreads, *implausible])
         words = best.words
         if not others:
             open_ = trace.other_forms(best, good)

@@ -1,5 +1,6 @@
 """What no candidate names: freely shaped pieces and deviating runs say where it lies."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 import identify
 from identify import diagnosis, start, trace, verdict
+from identify.effect import Effect
 from identify.effects import by_key
 from identify.effects.shaped import (
     LAGS,
@@ -21,6 +23,7 @@ from identify.effects.shaped import (
     lag,
 )
 from identify.executor import InProcess
+from identify.record import Campaign
 from identify.report.gallery import save_figures
 from identify.results import PLACES
 from identify.trace.places import deviating, remembering, shaped, whereabouts
@@ -223,6 +226,17 @@ def test_a_gross_misfit_of_one_place_is_sought_nowhere_else(tmp_path: Path) -> N
     assert {len(c.effects) for c in found.candidates} == {1}
 
 
+def assert_not_claimed(
+    recordings: Campaign, catalogue: Sequence[Effect], said: str, place: str
+) -> None:
+    """Unexplained, for what is `said`, and likely in that place."""
+    found = identify.diagnose(recordings, catalogue=catalogue)
+    assert (found.verdict, found.effects) == ("unexplained", ())
+    assert said in found.explanation
+    assert found.whereabouts is not None
+    assert place in found.whereabouts.likely
+
+
 @pytest.mark.slow
 def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -234,11 +248,7 @@ def test_what_only_comes_near_is_not_claimed_where_a_free_shape_is_far_likelier(
     loss = {"nonlinear_damping": {"cubic_s_per_m2": 0.7536}}
     recordings = thesis_campaign(tmp_path, 1050, loss, validation=3).campaign
     mode = [by_key("acoustic_mode:mode")]
-    found = identify.diagnose(recordings, catalogue=mode)
-    assert (found.verdict, found.effects) == ("unexplained", ())
-    assert "far less likely than a law" in found.explanation
-    assert found.whereabouts is not None
-    assert "forward" in found.whereabouts.likely
+    assert_not_claimed(recordings, mode, "far less likely than a law", "forward")
     monkeypatch.setattr(verdict, "DOUBTFUL", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
 
@@ -253,11 +263,7 @@ def test_what_no_candidate_names_and_is_random_is_no_law_that_follows_it(
     wander = {"flame_gain_modulation": gain}
     recordings = thesis_campaign(tmp_path, 1207, wander, validation=3).campaign
     cycle = [by_key("parameter_drift:flame_gain_cycle")]
-    found = identify.diagnose(recordings, catalogue=cycle)
-    assert (found.verdict, found.effects) == ("unexplained", ())
-    assert "no likelier than chance" in found.explanation
-    assert found.whereabouts is not None
-    assert "flame" in found.whereabouts.likely
+    assert_not_claimed(recordings, cycle, "no likelier than chance", "flame")
     monkeypatch.setattr(diagnosis, "SLIGHT", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=cycle).verdict == "traced"
 
@@ -273,11 +279,7 @@ def test_what_runs_that_differ_at_random_leave_is_no_law_of_a_slight_misfit(
     rig = random_rig(49026, modes=MOST_TWO)
     recordings = record(tmp_path, 49026, rig, wander, forced=8, validation=2).campaign
     mode = [by_key("acoustic_mode:mode")]
-    found = identify.diagnose(recordings, catalogue=mode)
-    assert (found.verdict, found.effects) == ("unexplained", ())
-    assert "no likelier than chance" in found.explanation
-    assert found.whereabouts is not None
-    assert "flame" in found.whereabouts.likely
+    assert_not_claimed(recordings, mode, "no likelier than chance", "flame")
     monkeypatch.setattr(diagnosis, "SLIGHT", 0.0)  # uncontested, it would have been claimed
     assert identify.diagnose(recordings, catalogue=mode).verdict == "traced"
 

@@ -238,17 +238,17 @@ def against_chance(tries: Sequence[Tried], others: Sequence[Tried] = ()) -> list
 
 
 def _bettered(t: Tried, others: Sequence[Tried], by: float) -> bool:
-    """Whether one of `others` is likelier `by` so much; a law than chance, with its numbers tuned
-    too, and chance than a law by that alone, or however little than one that may follow it."""
-    for o in others:
-        if t.spread is None and o.spread is not None:
-            better = _tuned_less(o, t) < (0.0 if t.follows_runs else -by)
-        else:
-            better = o.evidence < t.evidence - by
-            better &= t.spread is None or o.spread is not None or _tuned_less(t, o) > by
-        if better:
-            return True
-    return False
+    """Whether one of `others` is likelier `by` so much."""
+    return any(_likelier(o, t, by) for o in others)
+
+
+def _likelier(o: Tried, t: Tried, by: float) -> bool:
+    """Whether `o` is likelier than `t` `by` so much; a law than chance, with its numbers tuned too,
+    and chance than a law by that alone, or however little than one that may follow it."""
+    if t.spread is None and o.spread is not None:
+        return _tuned_less(o, t) < (0.0 if t.follows_runs else -by)
+    tuned = t.spread is not None and o.spread is None
+    return o.evidence < t.evidence - by and (not tuned or _tuned_less(t, o) > by)
 
 
 def unrivalled(tries: Sequence[Tried], pieces: Sequence[Tried]) -> list[Tried]:
