@@ -186,16 +186,15 @@ def undetermined(fit: Fit, data: Dataset, limit: float = 1.0) -> tuple[str, ...]
         if deviation <= limit:
             continue
         first, *others = (int(i) for i in np.argsort(-np.abs(v))[:4])
-        parts = [names[first]]
-        parts += [
-            f"{v[i] / v[first]:+.2g} of {names[i]}".replace("-", "−")
+        along = [
+            f"{names[i]} (by {v[i] / v[first]:+.2g} times as much)".replace("-", "−")
             for i in others
             if abs(v[i]) > 0.2
         ]
         lost = deviation > NOT_AT_ALL
-        how = "not at all" if lost else f"to a factor of {np.exp(deviation):.2g}"
-        out.append(f"{' with '.join([parts[0], ', '.join(parts[1:])]) if parts[1:] else parts[0]}"
-                   f" ({how})")  # fmt: skip
+        how = "known not at all" if lost else f"known to a factor of {np.exp(deviation):.2g} only"
+        moving = f", moved together with {', '.join(along)}" if along else ""
+        out.append(f"{names[first]}{moving}: {how}")
     return tuple(out)
 
 

@@ -7,9 +7,9 @@ unknowns' column of the covariance, so that a curved but harmless valley raises 
     t = (v − v̂)/s    and    √Δχ²
 
 must agree to a tenth. Where they do not, the interval is where the profile, χ² minimised over all
-other parameters, has risen by 3.84 (Wilks): found by a secant on ±√Δχ², nearly straight in v, all
-parameters and both sides fitted side by side. An end that no drive of the parameter reaches is
-open: «not bounded by these data».
+other parameters, has risen by 3.84 (Wilks): found by a secant on √Δχ², nearly straight in v, all
+parameters and both sides fitted side by side. An end is open, «not bounded by these data», where
+χ² has not risen so much at the parameter's own limit or as many standard errors away as is looked.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ FloatArray = npt.NDArray[np.float64]
 
 Z95 = 1.959964
 AGREE = 0.1  # relative difference of t and √Δχ² up to which an interval counts as Gaussian
-ROUNDS = 6  # of the secant
+ROUNDS = 10  # of the secant
 NEAR = 0.02  # of √Δχ², where it ends: a fortieth of a standard error
 FARTHEST = 8.0  # standard errors within which an end is looked for
 
@@ -58,17 +58,28 @@ def intervals(fit: Fit, data: Dataset) -> dict[str, Interval]:
 
 
 def _along_valleys(fit: Fit, data: Dataset) -> FloatArray:
-    """θ after a step of ±1.96 s of each parameter along its valley, (2, p, p)."""
+    """θ after a step of ±1.96 s of each parameter along its valley, (2, p, p); others that are at
+    their limit stay there."""
     straight = Straightened(OrbitResidual(fit.structure, data.fit), fit.structure)
     u = straight.inside(fit.theta)
     J = straight.to_inside(fit.jacobian[None], u[None])[0]
-    covariance = covariance_of(J)
     # ∂θ/∂u, column by column of the map's own inverse: rows of the identity carried outside
     to_u = straight.to_inside(np.eye(fit.theta.size)[None], u[None])[0]
-    by_theta = to_u @ covariance  # Cov(θ_j, u)
-    spread = np.sqrt(np.maximum(np.diag(to_u @ covariance @ to_u.T), 1e-300))
-    steps = Z95 * by_theta / spread[:, None]
+    low, high = fit.structure.parameters.bounds()
+    held = (fit.theta <= low) | (fit.theta >= high)
+    free = _by_theta(J, to_u, np.flatnonzero(~held))
+    for j in np.flatnonzero(held):
+        free[j] = _by_theta(J, to_u, np.flatnonzero(~held | (np.arange(held.size) == j)))[j]
+    own = np.einsum("ji,ji->j", to_u, free)
+    steps = Z95 * free / np.sqrt(np.maximum(own, 1e-300))[:, None]
     return np.stack([straight.outside(u + steps), straight.outside(u - steps)])
+
+
+def _by_theta(J: FloatArray, to_u: FloatArray, moving: npt.NDArray[np.int64]) -> FloatArray:
+    """Cov(θ_j, u), (p, p), with none but the `moving` u."""
+    covariance = np.zeros((J.shape[1], J.shape[1]))
+    covariance[np.ix_(moving, moving)] = covariance_of(J[:, moving])
+    return np.asarray(to_u @ covariance)
 
 
 def _rise(fit: Fit, data: Dataset, thetas: FloatArray) -> FloatArray:
@@ -108,57 +119,110 @@ def _profiled(
     moved = _along_valleys(fit, data)
     sides = [(j, side) for j in which for side in (0, 1)]
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 1e-300))
-    place = np.array([Z95 if side == 0 else -Z95 for _, side in sides])  # in s, of θ_j
-    starts = np.stack([moved[side, j] for j, side in sides])
-    column = np.array([j for j, _ in sides])
-    rows = np.arange(len(sides))
-    # secant from the optimum, where √Δχ² is 0
-    before_place, before_rise = np.zeros(len(sides)), np.zeros(len(sides))
-    done = np.zeros(len(sides), dtype=bool)
-    found = np.full(len(sides), np.nan)
     low, high = fit.structure.parameters.bounds()
+    searches = []
+    for j, side in sides:
+        room = (high[j] - fit.theta[j] if side == 0 else fit.theta[j] - low[j]) / sigma[j]
+        away = moved[side, j] - fit.theta
+        valley = fit.theta, away / abs(away[j] / sigma[j] or 1e-300)
+        searches.append(_End(min(FARTHEST, max(float(room), 0.0)), *valley))
     for _ in range(ROUNDS):
-        pinned = starts.copy()
-        pinned[rows, column] = fit.theta[column] + place * sigma[column]
+        left = [i for i, end in enumerate(searches) if not end.done]
+        if not left:
+            break
+        starts = [(i, start) for i in left for start in searches[i].starts]
+        column = np.array([sides[i][0] for i, _ in starts])
+        towards = np.array([1.0 if sides[i][1] == 0 else -1.0 for i, _ in starts])
+        place = np.array([searches[i].place for i, _ in starts])
+        rows = np.arange(len(starts))
+        pinned = np.stack([start for _, start in starts])
+        pinned[rows, column] = fit.theta[column] + towards * place * sigma[column]
         pinned = np.clip(pinned, low, high)
         bottom, top = np.tile(low, (rows.size, 1)), np.tile(high, (rows.size, 1))
         bottom[rows, column] = top[rows, column] = pinned[rows, column]
         descents = levenberg_marquardt(
             OrbitResidual(fit.structure, data.fit),
             pinned,
-            iterations=25,
+            iterations=40,
             tolerance=1e-3,
             bounds=(bottom, top),
         )
-        for i, descent in enumerate(descents):
-            if done[i]:
-                continue
-            if descent is None:  # no orbit there: half way back
-                place[i] = 0.5 * (place[i] + before_place[i])
-                continue
-            rise = float(np.sqrt(max(descent.cost - fit.chi2, 0.0)))
-            starts[i] = descent.theta
-            if abs(rise - Z95) < NEAR:
-                done[i], found[i] = True, place[i]
-                continue
-            slope = (rise - before_rise[i]) / (place[i] - before_place[i] or 1e-300)
-            before_place[i], before_rise[i] = place[i], rise
-            towards = np.sign(place[i])
-            step = (Z95 - rise) / slope if slope * towards > 1e-3 else towards * FARTHEST
-            place[i] = float(np.clip(place[i] + step, -FARTHEST, FARTHEST))
-            if place[i] * towards <= 0:
-                place[i] = 0.5 * before_place[i]
-        if done.all():
-            break
+        for i in left:
+            mine = [d for (n, _), d in zip(starts, descents, strict=True) if n == i]
+            lowest = min((d for d in mine if d is not None), key=lambda d: d.cost, default=None)
+            if lowest is None:
+                searches[i].at(np.inf)
+            else:
+                rise = float(np.sqrt(max(lowest.cost - fit.chi2, 0.0)))
+                searches[i].at(rise, lowest.theta)
     ends: dict[int, list[float | None]] = {j: [None, None] for j in which}
     parameters = fit.structure.parameters
     centre = parameters.to_physical(fit.theta)
-    for i, (j, _) in enumerate(sides):
-        if np.isfinite(found[i]):
+    for (j, side), end in zip(sides, searches, strict=True):
+        if end.found is not None:
             there = fit.theta.copy()
-            there[j] += found[i] * sigma[j]
+            there[j] += (end.found if side == 0 else -end.found) * sigma[j]
             even = parameters.parameters[j].kind == "even"
             passed = even and fit.theta[j] * there[j] < 0  # its size is least at zero
             value = 0.0 if passed else float(parameters.to_physical(there)[j])
             ends[j][int(value > centre[j])] = value
     return {j: (a, b) for j, (a, b) in ends.items()}
+
+
+class _End:
+    """The search for one end, by how many s it lies from the optimum: a secant on √Δχ², kept
+    between what is known to lie inside and outside."""
+
+    def __init__(self, room: float, centre: FloatArray, valley: FloatArray) -> None:
+        self.room = room  # that far there is anything to look for
+        self.place = min(Z95, room)
+        self._centre, self._valley = centre, valley  # the optimum, and the way from there by s
+        self._followed: FloatArray | None = None
+        self._inside, self._rise = 0.0, 0.0
+        self._outside, self._above = np.inf, np.inf
+        self._exact: float | None = None
+
+    @property
+    def starts(self) -> list[FloatArray]:
+        """Where to begin for the other parameters: along the valley, and beside the last place
+        that lies inside."""
+        along = self._centre + self.place * self._valley
+        return [along] if self._followed is None else [along, self._followed]
+
+    def at(self, rise: float, theta: FloatArray | None = None) -> None:
+        """√Δχ² of the profile at `place`, and where; infinite where no orbit exists."""
+        if abs(rise - Z95) < NEAR:
+            self._exact = self.place
+        elif rise < Z95:
+            self._inside, self._rise, self._followed = self.place, rise, theta
+        else:
+            self._outside, self._above = self.place, rise
+        self.place = self._next()
+
+    def _next(self) -> float:
+        """Where to look next: nearest to the middle third of what is left to look in, so that it
+        shrinks whatever the secant says."""
+        near, far = self._inside, min(self._outside, self.room)
+        if np.isfinite(self._above):
+            share = (Z95 - self._rise) / (self._above - self._rise)
+            guess, margin = near + share * (far - near), 0.1
+        elif np.isfinite(self._outside):  # beyond it no orbit exists
+            guess, margin = 0.5 * (near + far), 0.1
+        else:
+            slope = self._rise / near if near > 0 else 0.0
+            guess, margin = (Z95 / slope if slope > 0 else far), 0.0
+        least = near + margin * (far - near)
+        return float(np.clip(guess, least, far - margin * (far - near)))
+
+    @property
+    def done(self) -> bool:
+        """Whether it is found, or known to be open."""
+        return self._exact is not None or self._inside >= self.room
+
+    @property
+    def found(self) -> float | None:
+        """The end; where it has not been met to `NEAR`, what is known to lie outside: an interval
+        that may be a little too wide. None where there is none."""
+        if self._exact is not None:
+            return self._exact
+        return self._outside if np.isfinite(self._outside) else None

@@ -12,11 +12,14 @@ from daq.cli import app
 from daq.importers import open_campaign
 from identify.chances import beta_tail, chi2_points, chi2_tail, f_tail, rank_correlation
 from identify.declare import ModelError, described, read_model, structure_of
+from identify.descent import levenberg_marquardt
 from identify.effects import CATALOGUE
 from identify.harmonics import RecordError
-from identify.identification import declared_structure, fit_structure, prepare
+from identify.identification import declared_structure, fit_prepared, fit_structure, prepare
 from identify.load import load_campaign
+from identify.profile import intervals
 from identify.record import DeclaredModel
+from identify.residual import OrbitResidual
 from identify.trace.usable import usable
 from tests.identify_coefficients import WIDE, clean, drawn
 
@@ -138,6 +141,39 @@ def test_the_command_fits_the_file_s_model(tmp_path: Path) -> None:
     # physics.md §4: 0.400 ms to its third digit, and the misfit is gone
     assert delay["value"] == pytest.approx(4.0e-4, abs=5e-7 + 4 * delay["stderr"])
     assert told["chi2_per_dof"] < 1.6
+
+
+def test_an_element_at_its_limit_leaves_the_others_bounded() -> None:
+    """A speaker's resonance that these runs do not show: every other interval has two ends, each
+    where χ² has risen by 1.96²."""
+    structure = structure_of(
+        {
+            "format": "model/1",
+            "flame": {"delay": True},
+            "actuator": {"elements": ["actuator_dynamics:resonance"]},
+            "sensor": {"elements": ["channel_mismatch:gain"]},
+        }
+    )
+    campaign = replace(load_campaign(open_campaign(CASE)), declared_model=described(structure))
+    fit, data = fit_prepared(prepare(campaign, structure=structure))
+    found = intervals(fit, data)
+    at_limit = "actuator_dynamics.damping"
+    assert found.pop(at_limit).lower is None
+    assert fit.values[at_limit] == pytest.approx(0.005)
+    found.pop("actuator_dynamics.frequency_hz")  # above all that is heard, however far
+    assert all(i.lower is not None and i.upper is not None for i in found.values()), found
+    name = "mode1.frequency_hz"
+    assert found[name].method == "profile"
+    j = fit.structure.parameters.names.index(name)
+    for end in (found[name].lower, found[name].upper):
+        low, high = fit.structure.parameters.bounds()
+        low[j] = high[j] = np.log(end)
+        (descent,) = levenberg_marquardt(
+            OrbitResidual(fit.structure, data.fit),
+            fit.theta[None], iterations=80, bounds=(low, high),
+        )  # fmt: skip
+        assert descent is not None
+        assert np.sqrt(descent.cost - fit.chi2) == pytest.approx(1.96, abs=0.03)
 
 
 def test_tails_and_ranks_are_scipy_s() -> None:
