@@ -119,7 +119,7 @@ def diagnose(
             declared.p_value,
             signature(before, declared.scores),
         ),
-        candidates=_candidates(end.tried, chosen, declared.fit),
+        candidates=_candidates(end.tried, chosen, declared.fit, verdict),
         verdict=verdict,
         effects=effects,
         after=after,
@@ -336,7 +336,9 @@ def _with_lock_in(
     return replace(before, lock_in=found[0]), replace(after, lock_in=found[-1])
 
 
-def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tuple[Candidate, ...]:
+def _candidates(
+    tried: Sequence[Tried], chosen: Tried | None, base: Fit, verdict: Verdict
+) -> tuple[Candidate, ...]:
     ordered = trace.best_by_name(tried)
     if chosen is not None:  # what the verdict rests on stands first, its rivals as they are such
         first = [chosen, *trace.rivals(chosen, tried)]
@@ -347,8 +349,24 @@ def _candidates(tried: Sequence[Tried], chosen: Tried | None, base: Fit) -> tupl
     for t in ordered[:SHOWN]:
         alike = [o for o in good if t.explains and o is not t and _alike(t, o, chosen)]
         equal = [o.words for o in alike]
-        out.append(trace.candidate(t, base, equal))
+        passed_over = t.explains and t is not chosen and not any(o is chosen for o in alike)
+        out.append(
+            trace.candidate(t, base, equal, _passed_over(t, chosen, verdict) if passed_over else "")
+        )
     return tuple(out)
+
+
+def _passed_over(t: Tried, chosen: Tried | None, verdict: Verdict) -> str:
+    """Why what explains the data is not claimed."""
+    if chosen is None or verdict not in ("traced", "ambiguous"):
+        return "not the cause by itself"
+    if t.spread is not None or chosen.spread is not None:
+        return "the first is likelier"
+    more = t.fit.theta.size - chosen.fit.theta.size
+    numbers = f"{abs(more)} number{'' if abs(more) == 1 else 's'} {'more' if more > 0 else 'less'}"
+    change = t.chi2_of_all - chosen.chi2_of_all
+    change_words = f"χ² of all runs {change:+.1f}".replace("-", "−")
+    return f"the first is likelier: {change_words} with {numbers if more else 'as many numbers'}"
 
 
 def _alike(a: Tried, b: Tried, chosen: Tried | None) -> bool:

@@ -69,7 +69,11 @@ def judge(
                 for e in best.effects
                 if open_[e.name]
             ]
-            said = f"Adding {words} explains the data; no rival does."
+            less = {t.words: None for t in explaining if t.key != best.key and not best.within(t)}
+            rival = "nothing else does" if not less else (
+                f"of what else would, {' or '.join(list(less)[:3])}, none is as likely"
+            )  # fmt: skip
+            said = f"Adding {words} explains the data; {rival}."
             said += "".join(
                 f" {t.words} would do as well, but {t.implausibility}."
                 for t in trace.but_for_values(best, implausible)

@@ -330,7 +330,7 @@ def _plain(key: str) -> str:
 
 
 CANDIDATE_HEAD = ["effects", "location", "χ²/dof", "validation error", "p", "adequate",
-                  "plausible", "equivalent to"]  # fmt: skip
+                  "plausible", "equivalent to", "remark"]  # fmt: skip
 DETAILED = 6  # candidates whose parameters are listed
 
 
@@ -345,6 +345,7 @@ def candidate_rows(d: Diagnosis) -> list[list[str]]:
             "yes" if c.adequate else "no",
             "yes" if c.plausible else "no",
             ", ".join(c.equivalent_to),
+            c.note,
         ]
         for c in d.candidates
     ]

@@ -278,8 +278,9 @@ def outdone(t: Tried, pieces: Sequence[Tried]) -> bool:
     return _bettered(t, good, by=EVIDENCE)
 
 
-def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
-    """The candidate's line of the report: its gain over the declared model, corrected."""
+def candidate(t: Tried, declared: Fit, equal: Sequence[str], passed_over: str) -> Candidate:
+    """The candidate's line of the report: its gain over the declared model, corrected, and why it
+    is `passed_over` if it explains the data."""
     own = {q.name for e in t.effects for q in e.parameters}
     return Candidate(
         effects=t.names,
@@ -293,7 +294,7 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str]) -> Candidate:
         equivalent_to=tuple(equal),
         plausible=t.plausible,
         adequate=t.adequate,
-        note=_note(t),
+        note=_note(t) or passed_over,
     )
 
 

@@ -286,9 +286,6 @@ def show_diagnosis(found: "Diagnosis") -> None:
         ),
     )
     if found.candidates:
-        best, claimed = found.candidates[0], found.verdict in ("traced", "ambiguous")
-        as_good = {best.words, *best.equivalent_to} if claimed else set()
-        other = "the first is likelier" if claimed else "not the cause by itself"
         table(
             "candidates, best first",
             ("effects", "where", "χ²/dof", "validation", "objection"),
@@ -297,7 +294,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
                     *in_lines(c),
                     number(c.chi2_per_dof, 3),
                     number(c.validation_error, 3),
-                    c.objection or ("" if c.words in as_good else other),
+                    c.objection or c.note,
                 )
                 for c in found.candidates[:8]
             ),
