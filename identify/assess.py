@@ -173,6 +173,7 @@ def assess(fit: Fit, data: Dataset) -> Assessment:
         model_cycle=_model_cycle(fit, data, fitted),
         cross_validated=not data.validation,
         residual_tests=residual_tests(fit, data),
+        fit_p=lack_of_fit_p(fit.chi2, fit.dof),
     )
 
 
@@ -211,13 +212,17 @@ def cross_validation_error(fit: Fit, data: Dataset) -> float:
 def _measured_cycle(data: Dataset) -> LimitCycle | None:
     for b in (*data.fit, *data.validation):
         if b.free:
-            y = b.measured[0]
+            y = np.abs(b.measured[0])
+            size = np.sqrt(b.noise[0] / 2)  # of the noise along each coefficient
+            ratio = y / y[0]
+            spread = np.hypot(size, ratio * size[0]) / y[0]
             return LimitCycle(
                 float(b.at.omega[0] / (2 * np.pi)),
-                float(np.abs(y[0])),
-                tuple(float(q) for q in np.abs(y) / np.abs(y[0])),
+                float(y[0]),
+                tuple(float(q) for q in ratio),
                 float(b.frequency_stderr_hz[0]),
-                float(np.sqrt(b.noise[0, 0] / 2)),
+                float(size[0]),
+                harmonics_stderr=(0.0, *(float(q) for q in spread[1:])),
             )
     return None
 

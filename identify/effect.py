@@ -197,6 +197,11 @@ class Effect:
         of them a value lies, with no tangent: by name."""
         return {}
 
+    @property
+    def about(self) -> str:
+        """What it is, for people."""
+        return (type(self).__doc__ or "").strip().partition("\n\n")[0]
+
     def told(self, values: Mapping[str, float], span_s: float) -> str:
         """What an experimenter would ask next of these values, in a sentence; `span_s` is the time
         from the campaign's start to that of its last run."""

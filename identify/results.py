@@ -110,7 +110,8 @@ class LimitCycle:
 
 @dataclass(frozen=True)
 class Assessment:
-    """One fitted model against the data."""
+    """One fitted model against the data; `fit_p`: the chance that noise alone leaves as much of the
+    fitted runs."""
 
     structure: Structure
     fit: Fit
@@ -123,6 +124,7 @@ class Assessment:
     cross_validated: bool = False
     lock_in: tuple[LockIn, ...] = ()
     residual_tests: tuple[ResidualTest, ...] = ()
+    fit_p: float = float("nan")
 
     @property
     def chi2_per_dof(self) -> float:
@@ -159,6 +161,7 @@ class Assessment:
             "expected_error": number(self.expected_error),
             "chi2_per_dof": number(self.chi2_per_dof),
             "dof": self.dof,
+            "fit_p": number(self.fit_p),
             "parameters": {n: e.to_json() for n, e in self.parameters.items()}
             if self.fit.converged
             else {},

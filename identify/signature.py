@@ -37,13 +37,14 @@ def signature(assessment: Assessment, scores: Mapping[str, trace.ScoreTest]) -> 
             out[kind] = float(np.sqrt(np.mean(table[members] ** 2)))
     if len(forced) >= 4:
         amplitude = [rows[i].amplitude_v for i in forced]
-        out["correlation"] = {
+        asked = {
             "run_order": _rank_correlation(by_run[order], np.arange(len(order))),
             "amplitude": _rank_correlation(by_run[forced], np.array(amplitude)),
             "frequency": _rank_correlation(
                 by_run[forced], np.array([rows[i].frequency_hz for i in forced])
             ),
         }
+        out["correlation"] = {name: row for name, row in asked.items() if row is not None}
     total = float(np.sum(assessment.fit.residual**2))
     ranked = sorted(scores.items(), key=lambda item: -item[1].drop)[:8]
     out["tangents"] = {
@@ -53,8 +54,8 @@ def signature(assessment: Assessment, scores: Mapping[str, trace.ScoreTest]) -> 
     return out
 
 
-def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float | None:
+def _rank_correlation(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> dict[str, float] | None:
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return None
-    value = rank_correlation(a, b)[0]
-    return value if np.isfinite(value) else None
+    rho, p = rank_correlation(a, b)
+    return {"rho": rho, "p_value": p} if np.isfinite(rho) else None

@@ -1,6 +1,7 @@
 """What the commands that analyse do before and after their long work."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,10 @@ def test_the_signal_that_is_characterised_is_the_one_drawn(
     rows = [np.sin(2 * np.pi * 170 * t + a) + 0.01 * rng.standard_normal(t.size) for a in (0, 1)]
     recording = Recording({"photodiode": rows[0], "mic": rows[1]}, 5000.0, None, "V")
     assert primary(recording) == "mic"
+    rests = Recording({"channel1": rows[0], "p2": rows[1], "drive": 0 * rows[0]}, 5000.0, None, "V")
+    assert primary(rests) == "p2"
+    unnamed = {"channel1": rows[0], "channel2": 0 * rows[0]}
+    assert primary(Recording(unnamed, 5000.0, None, "V")) == "channel1"
     assert primary(recording, "photodiode") == "photodiode"
     with pytest.raises(ValueError, match="signal='p1' is not one of"):
         primary(recording, "p1")
@@ -85,6 +90,7 @@ def test_the_signal_that_is_characterised_is_the_one_drawn(
     np.testing.assert_allclose(drawn[0], rows[1])
     for note in json.loads((home / "found.json").read_text("utf-8"))["notes"]:
         assert note[:40] in out
+    assert re.search(r"signal +│ mic ", out)
 
 
 def test_what_a_diagnosis_can_find_is_listed(home: Path, capfd: pytest.CaptureFixture[str]) -> None:

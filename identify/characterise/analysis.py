@@ -12,7 +12,9 @@ something else modulates, or noise from beside the mode, makes them disagree. Th
 - ``intermittent``: it saturates, yet wanders between rest and oscillation.
 """
 
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +38,7 @@ _WIDE, _NARROW = 1 / 3, 1 / 8  # band-pass standard deviation over f₀
 _BANDS = (_WIDE, 1 / 5, _NARROW)
 _FILTER_RATIO = 0.8  # beyond it the band-pass, not the mode, sets the envelope's memory
 _LIMIT_CYCLE_KURTOSIS, _NOISE_KURTOSIS = 1.2, 1.8
-_PRIMARY = ("pressure", "p", "microphone")
+_PRIMARY = re.compile(r"(pressure|p|microphone|mic)[_ ]?\d*", re.IGNORECASE)
 
 
 def characterise(
@@ -114,12 +116,14 @@ def characterise(
 
 
 def primary(recording: Recording, signal: str | None = None) -> str:
-    """The name of the signal that is characterised: `signal`, else the pressure, else the last.
+    """The name of the signal that is characterised: `signal`, else the first pressure, else the
+    strongest: a drive that rests or a channel that hears nothing says nothing.
 
     Raises ValueError where the recording has no such signal.
     """
     names = list(recording.signals)
-    chosen = signal or next((n for n in names if n.lower() in _PRIMARY), names[-1])
+    strongest = max(names, key=lambda n: float(np.std(recording.signals[n])))
+    chosen = signal or next((n for n in names if _PRIMARY.fullmatch(n)), strongest)
     if chosen not in recording.signals:
         raise ValueError(f"signal={chosen!r} is not one of {names}")
     return chosen
@@ -129,9 +133,10 @@ def characterise_recording(recording: Recording, signal: str | None = None) -> C
     """Characterise its `primary` signal; phases of all the others."""
     chosen = primary(recording, signal)
     others = {name: y for name, y in recording.signals.items() if name != chosen}
-    return characterise(
+    found = characterise(
         recording.signals[chosen], recording.sample_rate_hz, others, unit=recording.unit
     )
+    return replace(found, signal=chosen)
 
 
 def characterise_file(
@@ -191,8 +196,10 @@ def _stochastic(
     if occupied.min() > 0.5 * occupied.max():
         notes += (
             "the envelope never comes near rest: the growth rate extrapolates the cubic law from"
-            f" amplitudes above {occupied.min():.3g}",
+            f" amplitudes above {occupied.min():.3g}, and how wrong that is nothing here says",
         )
+        growth = replace(chosen.growth_rate_per_s, stderr=np.inf)
+        chosen = replace(chosen, growth_rate_per_s=growth)
     return chosen, narrowest.saturation_lr > SATURATION_LR, notes
 
 

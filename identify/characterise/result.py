@@ -16,7 +16,8 @@ Regime = Literal["noise", "intermittent", "limit_cycle"]
 
 @dataclass(frozen=True)
 class Characterisation:
-    """One recording, characterised. `amplitude` is the fundamental's mean amplitude, in `unit`.
+    """One recording, characterised: channel `signal`. `amplitude` is the fundamental's mean
+    amplitude, in `unit`.
 
     `phase_deg` is each other channel's phase ahead of the signal at the fundamental.
     `kurtosis` is ⟨A⁴⟩/⟨A²⟩² of the envelope: 2 for a noise-driven linear mode, 1 for a pure cycle.
@@ -36,6 +37,7 @@ class Characterisation:
     sample_rate_hz: float
     samples: int
     notes: tuple[str, ...] = ()
+    signal: str = ""
 
     @property
     def harmonics_db(self) -> list[float]:
@@ -55,6 +57,7 @@ class Characterisation:
             saturation = _pair(self.mode.saturation) | {"unit": f"1/({self.unit}^2 s)"}
         return {
             "format": "characterisation/1",
+            "signal": self.signal,
             "regime": self.regime,
             "frequency_hz": _pair(self.frequency_hz),
             "amplitude": _pair(self.amplitude) | {"unit": self.unit},

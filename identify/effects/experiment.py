@@ -17,6 +17,14 @@ from identify.structure import Structure
 FloatArray = npt.NDArray[np.float64]
 
 FIRST = {"first_mode": "frequency", "first_damping": "damping"}  # what changes of mode 1 alone
+NAMED = {
+    "frequency": "All frequencies",
+    "first_mode": "Mode 1's frequency",
+    "flame_gain": "The flame's gain",
+    "damping": "All dampings",
+    "first_damping": "Mode 1's damping",
+    "speaker_gain": "The speaker's gain",
+}
 ONE_BY_ONE = ("frequency", "flame_gain", "damping", "speaker_gain")
 EACH_SIDE = 2  # runs at least, before and after a step: one alone is no evidence of a course
 
@@ -56,7 +64,8 @@ def changed(modes: list[Mode], what: str, factor: Any) -> list[Mode]:
 
 class Drift(Effect):
     """A relative change over the campaign: linear in time, with a quadratic part (``_curve``), or
-    towards a last value, as what warms up does (``_settling``).
+    towards a last value, as what warms up does (``_settling``). Times are shares of the time from
+    the campaign's start to its last run.
 
     ``frequency``: all modal frequencies together, as temperature does; ``flame_gain``: the fuel;
     ``damping``; ``speaker_gain``: a warming voice coil; ``first_mode`` and ``first_damping``: mode
@@ -88,9 +97,11 @@ class Drift(Effect):
         return None if self.settles else (0.0,) * len(self.parameters)
 
     def told(self, values: Mapping[str, float], span_s: float) -> str:
-        if not self.settles:
-            return ""
-        return _settles(values[self.parameters[1].name], span_s)
+        change, *more = (values[q.name] for q in self.parameters)
+        moved = f"{NAMED[self.what]}: {100 * change:+.3g} %".replace("-", "−")
+        if self.settles:
+            return f"{moved} in the end. {_settles(more[0], span_s)}"
+        return f"{moved} from the campaign's start to its last run, {span_s:.0f} s later."
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         return [(0.0, q) for q in (0.06, 0.1, 0.17, 0.3, 0.6)] if self.settles else []
@@ -110,7 +121,8 @@ def _settles(time: float, span_s: float) -> str:
 
 
 class Step(Effect):
-    """A relative change at once, as where a valve or a knob was turned between two runs.
+    """A relative change at once, as where a valve or a knob was turned between two runs. Times as
+    in a linear drift.
 
     Of what, as in `Drift`. It lies between two of the runs at `times`, those that are fitted and
     those that are not, with `EACH_SIDE` of the `fitted` before and after; without them is none.
@@ -176,7 +188,7 @@ def _next_to(times: FloatArray, when: float) -> tuple[float, float]:
 
 class Cycle(Effect):
     """A relative change to and fro, as where a thermostat or a compressor goes on and off:
-    1 + a sin ωt + b (1 − cos ωt).
+    1 + a sin ωt + b (1 − cos ωt). Times as in a linear drift.
 
     Of what, as in `Drift`.
     """
@@ -251,7 +263,7 @@ class SeveralDrifts(Effect):
 
 class Warming(Effect):
     """All frequencies and dampings change together towards a last value, as the tube's temperature
-    does; from where the frequencies alone came nearest."""
+    does; from where the frequencies alone came nearest. Times as in a linear drift."""
 
     name, location, form, refines = "parameter_drift", "experiment", "warming", True
     frequency = Drift("frequency_settling")

@@ -39,13 +39,22 @@ class Scatter(Effect):
     """Standard deviations of what changes from run to run, and the directions it takes."""
 
     def __init__(
-        self, name: str, location: str, form: str, sizes: Sequence[tuple[str, str, Direction]]
+        self,
+        name: str,
+        location: str,
+        form: str,
+        sizes: Sequence[tuple[str, str, Direction]],
+        about: str = "What passes here differs at random from run to run.",
     ) -> None:
-        self.name, self.location, self.form = name, location, form
+        self.name, self.location, self.form, self._about = name, location, form, about
         self.parameters = tuple(
             Parameter(f"{name}.{word}", unit, 0.0, 0.3, "positive") for word, unit, _ in sizes
         )
         self.directions = tuple(direction for _, _, direction in sizes)
+
+    @property
+    def about(self) -> str:
+        return f"{self._about} Standard deviations of the relative changes."
 
     @property
     def wanders(self) -> bool:
@@ -106,14 +115,21 @@ SCATTERS: tuple[Scatter, ...] = (
         "actuator",
         "",
         (("gain_rms", "1", DriveGain()), ("phase_rms_rad", "rad", DrivePhase())),
+        "What reaches the amplifier differs at random from run to run from the recorded drive, in "
+        "amplitude and phase.",
     ),
     Scatter(
-        "flame_gain_modulation", "flame", "", (("modulation_rms", "1", Change("flame_gain", 1e-2)),)
+        "flame_gain_modulation",
+        "flame",
+        "",
+        (("modulation_rms", "1", Change("flame_gain", 1e-2)),),
+        "The flame's gain differs at random from run to run.",
     ),
     Scatter(
         "parameter_drift",
         "experiment",
         "random",
         (("frequency_rms", "1", Change("frequency", 1e-3)),),
+        "All frequencies wander at random in the course of the campaign.",
     ),
 )

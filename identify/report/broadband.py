@@ -224,7 +224,7 @@ def _errors_figure(found: BroadbandDiagnosis) -> Figure:
     if found.noise is not None:
         ax.axvline(found.noise.rms, color=theme.NOISE, ls="--", label="noise")
     ax.set_xscale("log")
-    theme.narrow_decades(ax.xaxis)
+    theme.decades(ax.xaxis)
     ax.set_yticks(range(len(found.stages)), [_name(found, s) for s in found.stages])
     ax.set_ylim(len(found.stages) - 0.5, -0.5)
     theme.name_axes(ax, f"RMS simulation error ({found.unit})", "")

@@ -59,7 +59,9 @@ def html(
     return page(
         f"entrain: {result.campaign}",
         sections.verdict(result),
-        section("Error before and after", sections.errors(result), sections.limit_cycle(result)),
+        section(
+            sections.errors_title(result), sections.errors(result), sections.limit_cycle(result)
+        ),
         section(
             "Recordings",
             figure("recordings"),

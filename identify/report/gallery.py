@@ -104,12 +104,12 @@ def _of_comparisons(before: Assessment, after: Assessment | None) -> Iterator[Dr
     count = min(c.measured.size for c in before.comparisons)
     for first in range(1, count + 1, COLUMNS):
         orders = range(first, min(first + COLUMNS, count + 1))
-        span = f"{orders[0]} to {orders[-1]}" if len(orders) > 1 else f"{orders[0]}"
+        span = f"s {orders[0]} to {orders[-1]}" if len(orders) > 1 else f" {orders[0]}"
         yield Drawn(
             f"harmonics-{first}",
             "harmonics",
             harmonics_figure(before, after, orders),
-            f"Harmonics {span} of the velocity, run by run (* validation run). Phases are "
+            f"Harmonic{span} of the velocity, run by run (* validation run). Phases are "
             "relative to the drive; a free run's to its own fundamental.",
         )
     yield Drawn(

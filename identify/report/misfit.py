@@ -62,13 +62,13 @@ def heat_map(before: Assessment, after: Assessment | None) -> Figure:
         ax.set_xticks(np.arange(sizes.shape[1]) + 0.5, np.arange(1, sizes.shape[1] + 1))
         labels = [run_label(c) + (" *" if c.role == "validation" else "") for c in runs]
         ax.set_yticks(np.arange(len(runs)) + 0.5, labels)
-        ax.invert_yaxis()
         ax.grid(visible=False)
         ax.tick_params(length=0)
         for side in ("left", "bottom"):
             ax.spines[side].set_visible(False)
         theme.name_axes(ax, "harmonic", "", title)
     assert image is not None
+    axes[0].invert_yaxis()  # all share it
     edge = axes[-1].get_position()
     place = figure.add_axes((edge.x1 + 0.02, edge.y0, 0.018, edge.height))
     bar = figure.colorbar(image, cax=place, label="|residual| (noise units)")

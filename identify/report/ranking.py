@@ -38,7 +38,7 @@ def ranking(d: Diagnosis) -> Figure:
         if np.isfinite(value):
             right.plot(value * 100, at, "o", color=colour)
     _noise(right, d.noise_floor * 100)
-    theme.narrow_decades(right.xaxis)
+    theme.decades(right.xaxis)
     right.set_xlabel("validation error (%)")
     return figure
 

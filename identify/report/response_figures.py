@@ -90,7 +90,7 @@ def frequency_responses(before: Assessment, after: Assessment | None) -> Figure:
         top.set_yscale("log")
         theme.decades(top.yaxis)
         bottom.set_xscale("log")
-        theme.narrow_decades(bottom.xaxis)
+        theme.decades(bottom.xaxis)
         theme.name_axes(top, "", "magnitude" if column == 0 else "", names[column])
         theme.name_axes(bottom, "frequency (Hz)", "phase (°)" if column == 0 else "")
     axes[0, 2].axhline(1.0, color=theme.NOISE, lw=0.9, ls="--")

@@ -45,14 +45,19 @@ def error_rows(result: Result) -> list[list[str]]:
         ["noise and parameters' uncertainty", *(percent(a.expected_error) for a in shown)],
         ["validation error / noise floor", *(scientific(r) for r in ratio)],
         ["χ² per degree of freedom", *(scientific(a.chi2_per_dof) for a in shown)],
+        ["p of that χ²", *(probability(a.fit_p) for a in shown)],
         ["degrees of freedom", *(str(a.dof) for a in shown)],
         ["parameters", *(str(len(a.structure.parameters)) for a in shown)],
         ["fit", *("converged" if a.fit.converged else "not converged" for a in shown)],
     ]
     if isinstance(result, Diagnosis):
         blank = [""] * (len(shown) - 1)
-        rows.append(["p-value of the residual", probability(result.residual.p_value), *blank])
+        rows.append(["p of anything missing", probability(result.residual.p_value), *blank])
     return rows
+
+
+def errors_title(result: Result) -> str:
+    return "Error before and after" if len(columns(result)) > 1 else "Error"
 
 
 def errors(result: Result) -> str:
@@ -61,9 +66,14 @@ def errors(result: Result) -> str:
     note = (
         "Relative errors of the velocity's Fourier coefficients, the model's own steady state "
         "against the measured one. Noise floor: the validation error that noise alone would cause; "
-        "below it, what noise and the uncertainty of the fitted parameters would cause together."
+        "below it, what noise and the uncertainty of the fitted parameters would cause together. "
+        "p of anything missing: the least of the fitted runs', the held-out runs' and the "
+        "candidates' scores', corrected for so many questions."
     )
     return table(["", *heads], error_rows(result), note, tuple(numeric))
+
+
+CYCLE_HEAD = ["", "frequency (Hz)", "amplitude (m/s)", "harmonics 2, 3, … (dB)", "stability"]
 
 
 def cycle_rows(result: Result) -> list[list[str]]:
@@ -95,6 +105,8 @@ def _cycle(name: str, c: LimitCycle) -> list[str]:
 
 def _decibel(ratio: float, stderr: float) -> str:
     level = 20 * math.log10(ratio)
+    if stderr > ratio / 2:
+        return "≤ noise"
     if not stderr > 0:
         return f"{level:.1f}".replace("-", "−")
     return words.estimate(Estimate(level, 20 / math.log(10) * stderr / ratio, "1"))
@@ -119,7 +131,7 @@ def lock_in_rows(a: Assessment) -> list[list[str]]:
     ]
 
 
-RESIDUAL_TEST_HEAD = ["residual test", "asks", "deviations", "p"]
+RESIDUAL_TEST_HEAD = ["residual test", "asks", "standard deviations", "p"]
 RESIDUAL_TESTS = {
     "run_order": "whiteness over the order of recording",
     "harmonics": "independence of a run's harmonics",
@@ -208,8 +220,7 @@ def limit_cycle(result: Result) -> str:
     rows = cycle_rows(result)
     if not rows:
         return ""
-    head = ["free limit cycle", "frequency (Hz)", "amplitude (m/s)", "harmonics 2, 3, … (dB)", ""]
-    return table(head, rows, "", (1, 2))
+    return table(["free limit cycle", *CYCLE_HEAD[1:]], rows, "", (1, 2))
 
 
 def quality(result: Result) -> str:
@@ -310,8 +321,9 @@ def signature(values: Mapping[str, Any]) -> str:
 
 
 SIGNATURE_NOTE = (
-    "By harmonic, parity and kind of run: root mean square in noise units. Correlation: rank "
-    "correlation of a run's residual with run order, drive amplitude and frequency. Tangents: the "
+    "By harmonic, parity and kind of run: root mean square in noise units. Correlation: "
+    "Spearman's of the size of a run's residual with run order, drive amplitude and frequency. "
+    "Tangents: the "
     "share of χ² that a small effect of that kind would take away, and the share of its signature "
     "that the fitted parameters cannot absorb."
 )
@@ -358,13 +370,9 @@ def candidates(result: Result) -> str:
         "p: of the gain in χ² over the declared model, corrected for the number of candidates "
         "tried. Equivalent: predictions that these data cannot tell apart."
     )
-    details = [
-        [words.label(c), words.listed(c.parameters), c.note] for c in result.candidates[:DETAILED]
-    ]
-    noted = any(d[2] for d in details)
-    head = ["effects", "parameters", "note"]
+    details = [[words.label(c), words.listed(c.parameters)] for c in result.candidates[:DETAILED]]
     return table(CANDIDATE_HEAD, candidate_rows(result), note, (2, 3, 4)) + table(
-        head if noted else head[:2], details if noted else [d[:2] for d in details]
+        ["effects", "parameters"], details
     )
 
 

@@ -65,7 +65,7 @@ def _final(result: Result) -> Any:
 
 def _cycle(result: Result) -> str:
     rows = sections.cycle_rows(result)
-    head = ["free limit cycle", "frequency (Hz)", "amplitude (m/s)", "harmonics 2, 3, … (dB)", ""]
+    head = ["free limit cycle", *sections.CYCLE_HEAD[1:]]
     return plain_table(head, rows, right=(1, 2)) if rows else ""
 
 

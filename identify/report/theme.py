@@ -161,16 +161,21 @@ def name_axes(ax: Axes, x: str, y: str, title: str = "") -> None:
         ax.set_title(title)
 
 
+class _Few(LogLocator):
+    """Decades; parts of them where the axis spans little, as many as there is room for."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        span = vmax / vmin
+        parts = (1, 1.5, 2, 3, 5, 7) if span < 5 else (1, 2, 5) if span < 30 else (1,)
+        self.set_params(subs=parts)
+        return super().tick_values(vmin, vmax)
+
+
 def decades(axis: Axis) -> None:
     """Plain labels on a logarithmic axis: 0.01, 1, 100, 10⁻⁵; few, and no lesser ticks."""
+    axis.set_major_locator(_Few(base=10, numticks=12))
     axis.set_major_formatter(FuncFormatter(lambda x, _: power_of_ten(x)))
     axis.set_minor_locator(NullLocator())
-
-
-def narrow_decades(axis: Axis) -> None:
-    """The same where the axis spans less than two decades: 1, 2 and 5 of each are labelled."""
-    axis.set_major_locator(LogLocator(base=10, subs=(1.0, 2.0, 5.0)))
-    decades(axis)
 
 
 def power_of_ten(x: float) -> str:

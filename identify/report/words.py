@@ -55,6 +55,14 @@ def p_is(p: float) -> str:
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
+def asked(p: float) -> str:
+    """The p-value of the question whether there is anything to explain, and of what it is."""
+    return (
+        f"{p_is(p)}, the least of the fitted runs', the held-out runs' and the candidates' "
+        "scores', corrected for so many questions"
+    )
+
+
 def unit(name: str) -> str:
     """A unit as it is printed: nothing for 1, m⁻² for m^-2."""
     if name == "1":
@@ -127,7 +135,8 @@ def heading(result: Diagnosis | Identification) -> Heading:
 def _diagnosis(d: Diagnosis) -> Heading:
     evidence = []
     if d.before.fit.converged:
-        evidence.append(_misfit("The declared model", d.before, d.residual.p_value))
+        evidence.append(_misfit("The declared model", d.before))
+        evidence.append(f"Whether anything is missing from it: {asked(d.residual.p_value)}.")
     else:
         evidence.append(f"The declared model's fit did not converge: {d.before.fit.reason}.")
     headline = VERDICTS[d.verdict]
@@ -160,16 +169,17 @@ def _forms(e: TracedEffect) -> str:
     return f" ({forms})" if forms else ""
 
 
-def _misfit(subject: str, a: Assessment, p_value: float | None = None) -> str:
-    p = "" if p_value is None else f", {p_is(p_value)}"
+def _misfit(subject: str, a: Assessment) -> str:
+    own = f" ({p_is(a.fit_p)})" if math.isfinite(a.fit_p) else ""
     ratio = a.validation_error / a.noise_floor if a.noise_floor > 0 else math.nan
     expected = (
-        f"; with its parameters' uncertainty {percent(a.expected_error)} is to be expected"
+        f"; noise and the uncertainty of its parameters together let expect "
+        f"{percent(a.expected_error)}"
         if math.isfinite(a.expected_error)
         else ""
     )
     return (
-        f"{subject} has χ²/dof = {scientific(a.chi2_per_dof)} at {a.dof} degrees of freedom{p}; "
+        f"{subject} has χ²/dof = {scientific(a.chi2_per_dof)} at {a.dof} degrees of freedom{own}; "
         f"its validation error is {percent(a.validation_error)}, "
-        f"{scientific(ratio, 2)} times the noise floor of {percent(a.noise_floor)}{expected}."
+        f"{scientific(ratio)} times the noise floor of {percent(a.noise_floor)}{expected}."
     )

@@ -282,6 +282,9 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str], passed_over: str) -
     """The candidate's line of the report: its gain over the declared model, corrected, and why it
     is `passed_over` if it explains the data."""
     own = {q.name for e in t.effects for q in e.parameters}
+    values = {n: e for n, e in t.estimates.items() if n in own}
+    if not t.has_values:  # where a fit stopped is no estimate
+        values = {n: replace(e, stderr=np.nan) for n, e in values.items()}
     return Candidate(
         effects=t.names,
         forms=tuple(e.form for e in t.effects),
@@ -290,7 +293,7 @@ def candidate(t: Tried, declared: Fit, equal: Sequence[str], passed_over: str) -
         chi2_per_dof=t.fit.chi2_per_dof,
         validation_error=t.validation_error,
         p_value=gain_p(declared.chi2 - t.fit.chi2, t, declared),
-        parameters={n: e for n, e in t.estimates.items() if n in own},
+        parameters=values,
         equivalent_to=tuple(equal),
         plausible=t.plausible,
         adequate=t.adequate,

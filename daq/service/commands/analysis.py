@@ -1,7 +1,8 @@
 """`entrain identify`, `diagnose`: in this process, with a progress bar."""
 
+import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from daq.service.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from identify.parameters import Estimate
     from identify.record import Campaign
     from identify.results import Candidate, Diagnosis, Identification, QualityFlag
 
@@ -199,39 +201,20 @@ def show_identification(found: "Identification") -> None:
         )
         show_quality(found)
         return
-    show_parameters("parameters", found.to_json()["parameters"])
-    table(
-        "",
-        ("fit error", "validation error", "noise floor", "χ²/dof", "dof", "seconds"),
-        [
-            (
-                number(a.fit_error, 3),
-                number(a.validation_error, 3),
-                number(a.noise_floor, 3),
-                number(a.chi2_per_dof),
-                a.dof,
-                number(found.seconds, 3),
-            )
-        ],
-    )
-    rows = [("measured", a.measured_cycle), ("the model's own", a.model_cycle)]
-    table(
-        "free limit cycle",
-        ("", "frequency (Hz)", "amplitude (m/s)", "harmonics over the fundamental", ""),
-        (
-            (
-                name,
-                number(c.frequency_hz, 7),
-                number(c.amplitude, 5),
-                "  ".join(number(v, 3) for v in c.harmonics),
-                {True: "stable", False: "unstable", None: ""}[c.stable],
-            )
-            for name, c in rows
-            if c is not None
-        ),
-    )
+    show_parameters("parameters", a.parameters)
+    show_errors(found)
     show_validation(found)
     show_quality(found)
+
+
+def show_errors(found: "Identification | Diagnosis") -> None:
+    """Print errors and the free limit cycle, before and after where there are two models."""
+    from identify.report import sections
+
+    heads = [name for name, _ in sections.columns(found)]
+    table(sections.errors_title(found), ("", *heads), sections.error_rows(found))
+    if rows := sections.cycle_rows(found):
+        table("free limit cycle", sections.CYCLE_HEAD, rows)
 
 
 def show_validation(found: "Identification") -> None:
@@ -251,40 +234,22 @@ def show_validation(found: "Identification") -> None:
         out.print(note, markup=False)
 
 
-def show_parameters(title: str, parameters: dict[str, dict[str, Any]]) -> None:
+def show_parameters(title: str, parameters: "Mapping[str, Estimate]") -> None:
     """Print values with standard errors."""
+    from identify.report.words import unit, with_error
+
     table(
         title,
         ("parameter", "value", "standard error", "unit"),
-        (
-            (name, number(p["value"], 6), number(p["stderr"], 2), p["unit"])
-            for name, p in parameters.items()
-        ),
+        ((name, *with_error(e), unit(e.unit)) for name, e in parameters.items()),
     )
 
 
 def show_diagnosis(found: "Diagnosis") -> None:
     """Print errors before and after, the candidates, the verdict."""
-    before, after = found.before, found.after
-    table(
-        "error before and after",
-        ("", "before", "after"),
-        (
-            (
-                "validation error",
-                number(before.validation_error, 3),
-                number(after.validation_error, 3),
-            ),
-            ("fit error", number(before.fit_error, 3), number(after.fit_error, 3)),
-            ("χ² per degree of freedom", number(before.chi2_per_dof), number(after.chi2_per_dof)),
-            ("noise floor", number(found.noise_floor, 3), number(found.noise_floor, 3)),
-            (
-                "noise and parameters' uncertainty",
-                number(before.expected_error, 3) if before.fit.converged else "not converged",
-                number(after.expected_error, 3) if after.fit.converged else "not converged",
-            ),
-        ),
-    )
+    from identify.report.words import percent
+
+    show_errors(found)
     if found.candidates:
         table(
             "candidates, best first",
@@ -293,7 +258,7 @@ def show_diagnosis(found: "Diagnosis") -> None:
                 (
                     *in_lines(c),
                     number(c.chi2_per_dof, 3),
-                    number(c.validation_error, 3),
+                    percent(c.validation_error),
                     c.objection or c.note,
                 )
                 for c in found.candidates[:8]
@@ -302,9 +267,8 @@ def show_diagnosis(found: "Diagnosis") -> None:
     show_quality(found)
     out.print(f"[bold]verdict: {found.verdict}[/bold]   ({found.seconds:.1f} s)")
     for effect in found.effects:
-        row = effect.to_json()
         form = f", {effect.form}" if effect.form else ""
-        show_parameters(f"{row['effect']}{form} ({row['location']})", row["parameters"])
+        show_parameters(f"{effect.effect}{form} ({effect.location})", effect.parameters)
     if found.explanation:
         out.print(found.explanation, markup=False)
     if found.next_experiment:
@@ -385,12 +349,17 @@ def characterise(
 def show_characterisation(found: dict[str, Any]) -> None:
     """Print a characterisation."""
 
+    from identify.parameters import Estimate
+    from identify.report.words import estimate
+
     def pair(value: dict[str, Any] | None, unit: str) -> str:
         if value is None:
             return "–"
-        return f"{number(value['value'], 6)} ± {number(value['stderr'], 2)} {unit}"
+        stderr = math.nan if value["stderr"] is None else value["stderr"]
+        return estimate(Estimate(value["value"], stderr, unit))
 
     rows = [
+        ("signal", found["signal"]),
         ("regime", found["regime"]),
         ("frequency", pair(found["frequency_hz"], "Hz")),
         ("amplitude", pair(found["amplitude"], found["amplitude"]["unit"])),

@@ -26,7 +26,9 @@ def effects(
     found = [_facts(e) for e in CANDIDATES if name in (None, e.name)]
     write_json(json_, {"effects": found})
     if str(json_) != "-":
-        for (effect, location), forms in groupby(found, lambda f: (f["effect"], f["location"])):
+        order = list(dict.fromkeys(f["effect"] for f in found))
+        together = sorted(found, key=lambda f: order.index(f["effect"]))
+        for (effect, location), forms in groupby(together, lambda f: (f["effect"], f["location"])):
             indented(f"{effect}  ({location})", 0, "bold")
             for about, alike in groupby(forms, lambda f: f["about"]):
                 named, parameters = _joined(list(alike))
@@ -36,12 +38,11 @@ def effects(
 
 
 def _facts(effect: "Effect") -> dict[str, Any]:
-    about = (type(effect).__doc__ or "").strip().partition("\n\n")[0]
     return {
         "effect": effect.name,
         "form": effect.form,
         "location": effect.location,
-        "about": " ".join(about.replace("`", "").split()),
+        "about": " ".join(effect.about.replace("`", "").split()),
         "parameters": [
             {"name": q.name.partition(".")[2], "unit": q.unit, "range": [q.lower, q.upper]}
             for q in effect.parameters
