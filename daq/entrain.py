@@ -45,6 +45,7 @@ WEAK = 0.15  # relative level below which a free line's decay is linear
 # windows shorter than a turn of the free line, whose level depends on its phase.
 UNSURE = 0.3
 RISE = 1.5  # of the free line: it was not dying before; less is noise
+OFF_TARGET = 0.05  # relative error of the wanted multiple of the threshold that is worth a word
 CLEAR = 5  # standard errors that a falling line must stand out by for its rate to be read
 
 
@@ -317,11 +318,28 @@ def _settle(state: State, seen: Measurement) -> tuple[State, Command]:
     state = replace(
         _noted(state), settle_windows=state.settle_windows + 1, level=seen.free_amplitude
     )
-    if quiet and steady:
-        return state, Command("record", state.amplitude_v)
-    if state.settle_windows >= state.settings.max_settle_windows:
-        return state, Command("record", state.amplitude_v, reason="noise or drift did not settle")
-    return _hold(state)
+    restless = not (quiet and steady)
+    if restless and state.settle_windows < state.settings.max_settle_windows:
+        return _hold(state)
+    said = [*(["noise or drift did not settle"] if restless else []), *off_target(state)]
+    return state, Command("record", state.amplitude_v, reason="; ".join(said))
+
+
+def off_target(state: State) -> list[str]:
+    """What there is to say of a drive that is not the multiple of the threshold that was asked for:
+    it was set by what was known then, or is all that the output may give."""
+    aimed = state.settings.strategy == "predict" and state.task.amplitude_v is None
+    if not aimed or state.threshold_v is None:
+        return []
+    asked = max(state.task.over_threshold, state.settings.margin)
+    found = state.amplitude_v / state.threshold_v
+    if abs(found / asked - 1) <= OFF_TARGET:
+        return []
+    limit = " (the output's limit)" if state.amplitude_v >= state.settings.limit_v else ""
+    return [
+        f"the drive of {state.amplitude_v:.3g} V{limit} is {found:.3g} times the threshold as now "
+        f"known; {asked:.3g} were asked for"
+    ]
 
 
 def _enough(state: State) -> bool:

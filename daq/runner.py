@@ -295,6 +295,8 @@ class Runner:
             "remark": command.reason,
         }
         self.emit("entrained", item.index, seen)
+        if command.reason:
+            self.emit("remark", item.index, {"reason": command.reason})
         run = self.record(item, state.task.frequency_hz, command.amplitude_v, notes)
         status = "entrained" if run.exit_status == "success" else run.exit_status
         release = None

@@ -55,7 +55,7 @@ def diagnose(
     progress: Progress | None = None,
     cancel: Callable[[], bool] | None = None,
     executor: Executor | None = None,
-    catalogue: Sequence[Effect] = CANDIDATES,
+    catalogue: Sequence[Effect] | None = None,
     within_s: float = np.inf,
 ) -> Diagnosis:
     """Fit the declared model, trace what it lacks, refit, and say so.
@@ -64,7 +64,7 @@ def diagnose(
     ----------
     progress : called with (share done, what is being done).
     cancel : asked now and then; True raises `identify.trace.Cancelled`.
-    catalogue : effects to consider.
+    catalogue : effects to consider; by default all of `identify.effects.CANDIDATES`.
     within_s : seconds after which no further step that seeks an explanation begins; the one under
         way and the question where the misfit lies come on top. `unexplained` says so then.
 
@@ -90,7 +90,8 @@ def diagnose(
     recorded = prepare(campaign, structure)
     report(0.05, "fitting the declared model")
     fit = start.fit_declared(recorded.structure, recorded.data)
-    found = _searched(recorded, fit, catalogue, run, report, began + within_s)
+    effects_asked = CANDIDATES if catalogue is None else catalogue
+    found = _searched(recorded, fit, effects_asked, run, report, began + within_s)
     end = _Concluding(found, run, report, within_s).conclusion()
     declared, data, chosen = found.declared, found.ready.data, end.chosen
     tones = _tone_effects(found.ready.quality.tones)

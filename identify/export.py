@@ -49,6 +49,9 @@ def strict(value: Any) -> Any:
 def to_state_space(fit: Fit, part: Part = "forward", band_hz: float | None = None) -> StateSpace:
     """(A, B, C, D) of a linear part of the loop; see `identify.statespace.state_space`.
 
+    Inputs and outputs: ``forward`` from drive (V) and flame output (m) to velocity (m/s), ``flame``
+    from that velocity to the flame's input (m), ``closed_loop`` from drive to both. Frequency
+    responses with their standard errors: `identify.report.responses.responses`.
     ``scipy.signal.StateSpace(*to_state_space(fit))`` and ``control.ss(*to_state_space(fit))``.
     """
     return state_space(fit, part, band_hz)

@@ -1,7 +1,7 @@
 """Reads a campaign from the run store's files into plain arrays.
 
 The only module of `identify` that knows the run store, and it knows the files alone
-(`daq/store_file.py` and the README document them): `campaign.json`, and one HDF5 file a run in
+(`daq/store_file.py`; docs/run-store.md describes them): `campaign.json`, and one HDF5 file a run in
 `runs/`. Samples become physical values here: value = counts · volts_per_count / volts_per_unit,
 and channels that are known to lag (`skew_s`) are moved forward by an eighth-point Lagrange filter,
 whose error stays below 3e-5 up to a tenth of the sample rate.

@@ -198,7 +198,7 @@ class Assessment:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identification:
     """The declared model fitted to a campaign."""
 
@@ -209,6 +209,11 @@ class Identification:
     seconds: float
     undetermined: tuple[str, ...] = ()  # combinations of parameters that the data do not fix
     intervals: Mapping[str, Interval] = field(default_factory=dict)  # 95 %, by parameter
+
+    def __repr__(self) -> str:
+        a = self.assessment
+        said = f"χ²/dof {a.chi2_per_dof:.3g}" if a.fit.converged else a.fit.reason
+        return f"<Identification of {self.campaign!r}: {said}>"
 
     def to_json(self) -> dict[str, Any]:
         a = self.assessment
@@ -395,7 +400,7 @@ class Whereabouts:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """What the declared model lacks, or that nothing known explains it."""
 
@@ -412,6 +417,10 @@ class Diagnosis:
     seconds: float
     explanation: str = ""
     whereabouts: Whereabouts | None = None  # of an unexplained misfit
+
+    def __repr__(self) -> str:
+        said = ", ".join(f"{e.effect} ({e.location})" for e in self.effects)
+        return f"<Diagnosis of {self.campaign!r}: {self.verdict}{f', {said}' if said else ''}>"
 
     @property
     def noise_floor(self) -> float:

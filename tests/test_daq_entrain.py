@@ -8,7 +8,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daq.entrain import Command, Settings, State, Strategy, Task, begin, step
+from daq.entrain import (
+    Command,
+    Settings,
+    State,
+    Strategy,
+    Task,
+    begin,
+    off_target,
+    step,
+)
 from daq.lockin import FreeCycle, Measurement, measure
 from daq.tongue import Law
 
@@ -70,6 +79,20 @@ def test_it_ends_within_its_limits_whatever_it_sees(
     if command.kind == "give_up":
         assert command.amplitude_v == 0.0
         assert command.reason
+
+
+def test_a_drive_that_is_not_what_was_asked_for_is_said_so() -> None:
+    """1.3 times the threshold, as it was thought to be, were 1.085 times what it is."""
+    state, _ = begin(Task(160.0, over_threshold=1.3), FREE, LIMITS)
+    near = replace(state, amplitude_v=0.78, threshold_v=0.592)
+    assert off_target(near) == []
+    (said,) = off_target(replace(near, amplitude_v=0.642))
+    assert said == (
+        "the drive of 0.642 V is 1.08 times the threshold as now known; 1.3 were asked for"
+    )
+    (said,) = off_target(replace(near, amplitude_v=2.0, task=Task(160.0, over_threshold=1e9)))
+    assert "2 V (the output's limit) is 3.38 times" in said
+    assert off_target(replace(near, amplitude_v=0.642, task=Task(160.0, amplitude_v=0.642))) == []
 
 
 def at_limit(measurement: Measurement, task: Task | None = None) -> Command:

@@ -17,7 +17,7 @@ def reproduce(
 ) -> None:
     """Make the thesis's tables and figures again, theirs beside ours, on one page.
 
-    Some two minutes of computing, most of them for tracing what the re-enacted experiment lacks.
+    Some minutes of computing, most of them for tracing what the re-enacted experiment lacks.
     """
     from daq.service.reproduce import reproduce as make
 
