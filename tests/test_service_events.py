@@ -72,12 +72,25 @@ def test_resume_and_what_is_too_old_counts_as_dropped() -> None:
         for value in range(30):
             bus.publish("level", {"value": value})
         out = []
-        for since in (25, 0):
+        for since in (25, 5, 0):
             client = bus.subscribe(since=since)
             out.append(([event.seq for event in await client.next(5)], client.dropped))
         return out
 
-    assert asyncio.run(scenario()) == [([26, 27, 28, 29, 30], 0), (list(range(21, 31)), 20)]
+    kept = list(range(21, 31))
+    # who has seen nothing yet has lost nothing
+    assert asyncio.run(scenario()) == [([26, 27, 28, 29, 30], 0), (kept, 15), (kept, 0)]
+
+
+def test_a_first_visit_finds_more_than_its_queue_holds_and_lags_by_nothing() -> None:
+    async def scenario() -> tuple[int, int]:
+        bus = Bus(history=100, queue=5)
+        bus.attach(asyncio.get_running_loop())
+        for value in range(30):
+            bus.publish("level", {"value": value})
+        return bus.subscribe(since=0).dropped, bus.subscribe(since=1).dropped
+
+    assert asyncio.run(scenario()) == (0, 24)
 
 
 def test_kinds_filter_and_silence_is_no_error() -> None:

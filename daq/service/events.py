@@ -19,6 +19,7 @@ the JSON holds `seq`, `kind`, `time`, and the array's `shape`.
 
 import asyncio
 import json
+import secrets
 import struct
 import threading
 from collections import Counter, OrderedDict, deque
@@ -124,6 +125,7 @@ class Bus:
         self._dropped_before = 0
         self._forgotten = 0  # kept events that had to give way, and the last one's number
         self._forgotten_seq = 0
+        self.born = secrets.token_hex(4)  # another one's events are numbered anew
 
     def attach(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop, self._delivering = loop, False
@@ -213,7 +215,8 @@ class Bus:
         """A new client, on the loop's thread.
 
         With `since`, it first gets the kept events behind that number; those that had to give
-        way meanwhile count as dropped (at most so many they were).
+        way meanwhile count as dropped (at most so many they were). Behind 0 it has missed nothing:
+        what happened before it came is no loss of its own.
         """
         with self._lock:
             behind = self._seq if since is None else min(since, self._seq)
@@ -223,6 +226,8 @@ class Bus:
         client.dropped = max(0, forgotten)
         for event in kept:
             client.offer(event)
+        if behind == 0:
+            client.dropped = 0
         self._clients.add(client)
         return client
 

@@ -113,7 +113,7 @@ def _frame(event: Event) -> str:
 
 
 def _hello(service: Service) -> str:
-    return f'{{"kind":"hello","seq":{service.bus.seq}}}'
+    return f'{{"kind":"hello","seq":{service.bus.seq},"service":"{service.bus.born}"}}'
 
 
 def _dropped(client: Subscription) -> str:

@@ -2,7 +2,7 @@
 import { api, get, key } from "./api.js";
 
 const listeners = new Map();
-let seq = 0, socket = null, lastHeard = 0, delay = 500, state = "connecting", lostAt = null;
+let seq = 0, service = null, socket = null, lastHeard = 0, delay = 500, state = "connecting", lostAt = null;
 
 export function on(kind, listener) {
   if (!listeners.has(kind)) listeners.set(kind, new Set());
@@ -49,7 +49,14 @@ async function open() {
     delay = 500;
     const event = typeof message.data === "string" ? JSON.parse(message.data) : parse(message.data);
     if (event.kind === "hello") {
-      if (event.seq < seq) { seq = 0; socket.close(); return; }  // the service was started anew
+      if (service && service !== event.service) {  // started anew: its events are others, from 1 on
+        service = null;
+        seq = 0;
+        emit("restarted", event);
+        socket.close();
+        return;
+      }
+      service = event.service;
       setState("connected");
       emit("resumed", event);
     }
