@@ -441,7 +441,7 @@ class Runner:
         """Silent, and known to be."""
         self.rig.silence()
         self.drive_v = 0.0
-        self.emit("suspended", item.index, {"reason": reason})
+        self.emit("suspended", item.index, {"kind": item.kind, "reason": reason})
 
     # small things
 
@@ -506,7 +506,8 @@ class Runner:
     def watch(self, index: int, state: State, seen: Measurement) -> None:
         """Show a window; `seen` is the state's last."""
         self.drive_v = state.last_drive_v
-        self.emit("window", index, {**_seen(state), "frequency_hz": seen.frequency_hz})
+        wanted = {"frequency_hz": seen.frequency_hz, "criterion_db": self.plan.criterion_db}
+        self.emit("window", index, {**_seen(state), **wanted})
         self.checkpoint()
 
     def emit(self, kind: str, index: int | None, data: dict[str, Any]) -> None:

@@ -78,7 +78,9 @@ def test_a_campaign_from_request_to_runs(server: Running, client: httpx.Client) 
     assert kinds[0] == "started"
     assert kinds[-1] == "finished"
     assert kinds.count("recorded") == 3
-    assert "free run: 169.7" in " ".join(client.get(f"/jobs/{job['id']}/log").json())
+    said = [line.partition(" ")[2] for line in client.get(f"/jobs/{job['id']}/log").json()]
+    assert "free run: 169.7" in " ".join(said)
+    assert {"free run: recorded", "condition 1: recorded", "condition 2: recorded"} <= set(said)
 
 
 def test_watching_shows_levels_waveform_and_spectrum(server: Running, client: httpx.Client) -> None:
@@ -137,11 +139,13 @@ def test_bad_campaigns_are_refused(
         assert says in answer.json()["detail"]
 
 
+@pytest.mark.parametrize("early", [True, False])
 def test_emergency_stop_reaches_the_rigs_process_and_latches(
-    server: Running, client: httpx.Client
+    server: Running, client: httpx.Client, early: bool
 ) -> None:
+    """Also one whose process is only about to open the rig."""
     job = client.post("/campaigns", json={"rig": "slow", "plan": PLAN}).json()
-    until(client, job["id"], lambda _: "free" in event_kinds(server, job["id"]))
+    until(client, job["id"], lambda _: early or "free" in event_kinds(server, job["id"]))
     started = time.perf_counter()
     answer = client.post("/rigs/slow/emergency-stop").json()
     assert time.perf_counter() - started < 0.5
@@ -179,7 +183,11 @@ def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> N
     assert client.post(f"/jobs/{number}/pause").status_code == 423
     mine = {"X-Control-Token": lock}
     assert client.post(f"/jobs/{number}/pause", headers=mine).status_code == 202
+    until(client, number, lambda seen: seen["hold"] == "paused")
+    assert client.get("/rigs/slow").json()["state"] == "paused"
+    assert "paused: the speaker is silent" in client.get(f"/jobs/{number}/log").json()[-1]
     assert client.post(f"/jobs/{number}/resume", headers=mine).status_code == 202
+    until(client, number, lambda seen: seen["hold"] is None)
     until(client, number, lambda _: "free" in event_kinds(server, number))
     assert client.post(f"/jobs/{number}/stop", headers=mine).status_code == 202
     until(client, number, ended)

@@ -36,6 +36,7 @@ from daq.service.plain import plain
 from daq.service.processes import context
 
 State = Literal["queued", "running", "succeeded", "failed", "cancelled"]
+Hold = Literal["pausing", "paused"]
 FINISHED: frozenset[str] = frozenset({"succeeded", "failed", "cancelled"})
 LOG_LINES = 500
 ANALYSIS_NICE = 10  # a fit gives way to the acquisition and to the service
@@ -55,6 +56,8 @@ class Link:
         self._pipe = pipe
         self._lock = threading.Lock()
         self._handlers: dict[str, Callable[[dict[str, Any]], None]] = {}
+        self._hearing = threading.Lock()
+        self._early: list[tuple[str, dict[str, Any]]] = []  # commands that nobody heard yet
 
     def _send(self, kind: str, *body: Any) -> None:
         # A service that is gone cannot listen; the work goes on and notices by its own means.
@@ -76,9 +79,21 @@ class Link:
             "event", kind, data, None if samples is None else np.asarray(samples, np.float32)
         )
 
+    def hold(self, how: Hold | None) -> None:
+        """The work is about to wait for its operator, waits, or (None) goes on."""
+        self._send("hold", how)
+
     def on(self, command: str, handler: Callable[[dict[str, Any]], None]) -> None:
-        """Call `handler` (on a thread of its own) when the service sends `command`."""
-        self._handlers[command] = handler
+        """Call `handler` (on a thread of its own) when the service sends `command`.
+
+        One that came while the work was still preparing itself is heard now: a stop counts then.
+        """
+        with self._hearing:
+            self._handlers[command] = handler
+            early = [body for name, body in self._early if name == command]
+            self._early = [one for one in self._early if one[0] != command]
+        for body in early:
+            handler(body)
 
     def listen(self) -> None:
         """Hear commands until the pipe closes; `lost` is the command that says so.
@@ -91,7 +106,10 @@ class Link:
             except (EOFError, OSError):
                 self._handlers.get("lost", _give_up)({})
                 return
-            handler = self._handlers.get(command)
+            with self._hearing:
+                handler = self._handlers.get(command)
+                if handler is None:
+                    self._early.append((command, body))
             if handler is not None:
                 handler(body)
             self._send(ACKNOWLEDGED, number, handler is not None)
@@ -140,6 +158,7 @@ class Job:
     state: State = "queued"
     progress: float = 0.0
     message: str = ""
+    hold: Hold | None = None
     created: str = ""
     started: str | None = None
     finished: str | None = None
@@ -163,7 +182,7 @@ class Job:
     def summary(self) -> dict[str, Any]:
         """What lists and events show: all but log, result and arguments."""
         names = ("id", "kind", "title", "lane", "owner", "about", "state", "progress", "message")
-        times = ("created", "started", "finished", "error")
+        times = ("hold", "created", "started", "finished", "error")
         return {name: getattr(self, name) for name in (*names, *times)}
 
 
@@ -310,7 +329,7 @@ class JobManager:
         error: str | None = None,
     ) -> None:
         with self._lock:
-            job.finished, job.outcome, job.error = self._now(), result, error
+            job.finished, job.outcome, job.error, job.hold = self._now(), result, error, None
             if state == "succeeded":
                 job.progress = 1.0
             self._running.pop(job.id, None)
@@ -470,6 +489,9 @@ class _Running:
             job.progress, job.message = items
             about = {"job": job.id, **job.about}
             bus.publish("progress", {**about, "progress": items[0], "message": items[1]})
+        elif kind == "hold":
+            job.hold = items[0]
+            self._manager._tell(job)
         elif kind == "log":
             job.log.append(f"{self._manager._now()} {items[0]}")
             bus.publish("log", {"job": job.id, **job.about, "text": items[0]})

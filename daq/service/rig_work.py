@@ -36,6 +36,7 @@ class Helm:
 
     def __init__(self, link: Link, rig: DuplexRig) -> None:
         self._rig = rig
+        self._link = link
         self._paused = threading.Event()
         self._skip = threading.Event()
         self._end: str | None = None
@@ -53,9 +54,13 @@ class Helm:
             self._rig.silence()
             # Also a pause that is taken back at once must be seen: by the silence.
             self._rig.clock.sleep(self._rig.limits.silence_ramp_s + 0.05)
+            self._link.log("paused: the speaker is silent")
+            self._link.hold("paused")
             while self._paused.is_set() and self._end is None and not self._skip.is_set():
                 self._turned.wait(0.2)
                 self._turned.clear()
+            self._link.hold(None)
+            self._link.log("the pause is over")
         if self._end is not None:
             raise StopRequested(self._end)
         if self._skip.is_set():
@@ -64,9 +69,11 @@ class Helm:
 
     def _on_pause(self, body: dict[str, Any]) -> None:
         self._paused.set()
+        self._link.hold("pausing")
 
     def _on_resume(self, body: dict[str, Any]) -> None:
         self._paused.clear()
+        self._link.hold(None)
         self._turned.set()
 
     def _on_skip(self, body: dict[str, Any]) -> None:
@@ -193,6 +200,8 @@ def describe(event: Event) -> str:
     """One line for people."""
     data = event.data
     where = "" if event.index is None else f"condition {event.index}: "
+    if data.get("kind") in ("free", "cold"):  # kinds of runs; all others are forced
+        where = f"{data['kind']} run: "
     if event.kind == "free":
         return f"free run: {data['frequency_hz']:.2f} Hz, amplitude {data['amplitude']:.4g} Pa"
     if event.kind == "review":
@@ -211,11 +220,15 @@ def describe(event: Event) -> str:
         )
     if event.kind in ("recorded", "not_entrained", "skipped"):
         reason = f" ({data['reason']})" if data.get("reason") else ""
-        return f"{where}{data['status']}{reason}"
+        good = data["status"] in ("success", "entrained")
+        return f"{where}{'recorded' if good else data['status'].replace('_', ' ')}{reason}"
+    if event.kind == "suspended" and data["reason"] == "paused":
+        return f"{where}from its beginning, after the pause"
     if event.kind == "law":
         return (
-            f"growth rate {data['growth_rate_per_s']:.3g} 1/s, "
-            f"twist {data['twist_per_s']:.3g} 1/s: thresholds are predicted from these"
+            f"the limit cycle grows at {data['growth_rate_per_s']:.3g} 1/s and turns "
+            f"{data['twist_per_s']:.3g} rad/s faster when small: thresholds are predicted from "
+            "these"
         )
     reason = f": {data['reason']}" if data.get("reason") else ""
     return f"{where}{event.kind}{reason}"

@@ -2,12 +2,13 @@
 
 import asyncio
 import logging
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Header
 from starlette.concurrency import run_in_threadpool
 
 from daq.service.control import lane
+from daq.service.jobs import Job
 from daq.service.keys import Principal
 from daq.service.state import Controller, Parts, Reader, Service
 from daq.service.wire import Lock, LockRequest, Rig, Stopped
@@ -21,19 +22,25 @@ def describe(service: Service, name: str) -> Rig:
     """One rig as the API shows it."""
     entry = service.check_rig(name)
     jobs = [job for job in service.jobs.all() if job.lane == lane(name)]
-    running = next((job.id for job in jobs if job.state == "running"), None)
+    running = next((job for job in jobs if job.state == "running"), None)
     stopped_by = service.control.stopped(name)
     lease = service.control.holder(name)
     return Rig(
         name=name,
         driver=entry.driver,
-        state="stopped" if stopped_by else ("running" if running else "idle"),
+        state="stopped" if stopped_by else _moving(running),
         stopped_by=stopped_by,
         holder=lease.holder if lease else None,
-        job=running,
+        job=running.id if running else None,
         queued=sum(job.state == "queued" for job in jobs),
         removable=entry.source == "added",
     )
+
+
+def _moving(job: Job | None) -> Literal["idle", "running", "paused"]:
+    if job is None:
+        return "idle"
+    return "paused" if job.hold == "paused" else "running"
 
 
 @router.get("/rigs")

@@ -72,7 +72,7 @@ class Rig(Answer):
 
     name: str = Field(examples=["simulated"])
     driver: str = Field(examples=["simulated"])
-    state: Literal["idle", "running", "stopped"] = Field(examples=["idle"])
+    state: Literal["idle", "running", "paused", "stopped"] = Field(examples=["idle"])
     stopped_by: str | None = Field(default=None, description="Who pressed the emergency stop")
     holder: str | None = Field(default=None, description="Who has control")
     job: str | None = Field(default=None, description="The job that runs on it")
@@ -117,6 +117,9 @@ class JobSummary(Answer):
     state: Literal["queued", "running", "succeeded", "failed", "cancelled"]
     progress: float = Field(examples=[0.4])
     message: str = Field(examples=["refitting with flame_delay"])
+    hold: Literal["pausing", "paused"] | None = Field(
+        default=None, description="A campaign that was told to pause: until its next window, since"
+    )
     created: str = Field(examples=["2026-01-31T12:00:00.000Z"])
     started: str | None = None
     finished: str | None = None
