@@ -77,6 +77,12 @@ def test_runs_come_in_pages_and_by_filter(client: httpx.Client) -> None:
     assert len(seen) == len(set(seen)) == 3
     assert len(client.get("/runs", params={"role": "validation"}).json()["items"]) == 1
     assert client.get("/runs", params={"rig": "none"}).json() == {"items": [], "next": None}
+    for since, count in (("2020-01-31", 3), ("2020-01-31T12:00:00+01:00", 3), ("2999-01-01", 0)):
+        assert len(client.get("/runs", params={"since": since}).json()["items"]) == count
+    for name in ("since", "until"):
+        refused = client.get("/runs", params={name: "yesterday"})
+        assert refused.status_code == 422
+        assert f"{name}='yesterday' is neither a time nor a date" in refused.json()["detail"]
 
 
 def test_samples_are_in_the_channels_unit(client: httpx.Client, run: str) -> None:

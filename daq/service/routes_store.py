@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import asdict
+from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Annotated, Any, TypeVar
 
@@ -103,13 +104,30 @@ def runs(
         exit_status=exit_status,
         min_frequency_hz=min_frequency_hz,
         max_frequency_hz=max_frequency_hz,
-        since=since,
-        until=until,
+        since=_instant("since", since),
+        until=_instant("until", until),
         verdict=verdict,
     )
     rows = service.store.runs(query, after=after, limit=limit + 1)
     items = [Run(**asdict(row), id=row.id) for row in rows[:limit]]
     return Page(items=items, next=items[-1].id if len(rows) > limit else None)
+
+
+def _instant(name: str, text: str | None) -> str | None:
+    """A time as the catalogue writes it, so that they compare as text."""
+    if text is None:
+        return None
+    try:
+        told = datetime.fromisoformat(text)
+    except ValueError:
+        raise Problem(
+            422,
+            "validation",
+            f"{name}={text!r} is neither a time nor a date as in RFC 3339, such as "
+            "2026-01-31T12:00:00Z or 2026-01-31",
+        ) from None
+    utc = told.replace(tzinfo=UTC) if told.tzinfo is None else told.astimezone(UTC)
+    return utc.isoformat(timespec="milliseconds").removesuffix("+00:00")
 
 
 def _read(
