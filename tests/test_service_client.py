@@ -1,5 +1,7 @@
 """The Python client against a real server, and the documentation against the routes."""
 
+import json
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,24 @@ def test_every_route_is_documented() -> None:
     assert (ROOT / "docs" / "api.md").read_text(encoding="utf-8") == document.page(), (
         "run: python -m daq.service.document > docs/api.md"
     )
+
+
+@pytest.mark.parametrize("keyed", [False, True])
+def test_the_page_s_commands_work_as_printed(tmp_path: Path, keyed: bool) -> None:
+    lines = [line.strip() for line in document.page().splitlines() if line.startswith("    ")]
+    given = [line for line in lines if line.startswith("export")]
+    asked = next(line for line in lines if line.endswith('"$ENTRAIN/me"'))
+    moved = next(line for line in lines if line.endswith('"$ENTRAIN/rigs/simulated/reset"'))
+    key = KeyStore(tmp_path / "keys.json").create("desk", ["control"])[1] if keyed else ""
+    with running(tmp_path, server=ServerSettings(require_key=keyed)) as server:
+        given.append(f"ENTRAIN={server.url}/api/v1")
+        if keyed:
+            given.append(f"KEY='Authorization: Bearer {key}'")
+        script = "\n".join([*given, asked, "echo", moved])
+        told = subprocess.run(["bash", "-c", script], capture_output=True, text=True, timeout=20)
+    me, rig = map(json.loads, told.stdout.splitlines())
+    assert me["name"] == ("desk" if keyed else "local")
+    assert rig["state"] == "idle"
 
 
 def test_every_route_but_the_public_ones_needs_a_scope() -> None:

@@ -24,8 +24,8 @@ form is `/api/v1/openapi.json` (OpenAPI 3.1). Numbers are SI with the unit in th
 RFC 3339 in UTC.
 
     export ENTRAIN=http://127.0.0.1:8000/api/v1
-    export KEY="Authorization: Bearer ent_..."        # not needed on loopback without keys
-    export TOKEN=                                     # the lock's, while you hold one
+    export KEY=             # where keys are needed: KEY="Authorization: Bearer ent_..."
+    export TOKEN=           # the lock's, while you hold one
 
 - **Errors** are problem details (RFC 9457): `type`, `title`, `status`, `detail`, `request`.
 - **Scopes**: `read` sees, `control` moves a rig and starts work, `configure` changes what others
@@ -38,7 +38,8 @@ RFC 3339 in UTC.
   again (kept in memory; not for uploads).
 - **Pages**: `after=` the `next` of the page before. **ETags** on campaigns and runs.
 - **Live**: WebSocket `/live/ws?since=N&kinds=a,b` and server-sent events `/live/events`. Events
-  have a `seq`; `since` (or `Last-Event-ID`) resumes. Kinds: `job`, `progress`, `log`, `campaign`,
+  have a `seq`; `since` (or `Last-Event-ID`) resumes. `hello` comes first: another `service` in it
+  than before means a new start, and numbers from 1 on. Kinds: `job`, `progress`, `log`, `campaign`,
   `control`, `emergency_stop`, `reset`, and the pictures of the moment `levels`, `waveform`,
   `spectrum`, of which a newer one takes the place of one that still waits. Who lags loses its
   oldest events and is told how many (`dropped`). Over the
