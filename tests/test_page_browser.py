@@ -4,9 +4,15 @@ What the page shows is compared with what the API says. Nothing may come from el
 console must stay empty.
 """
 
+import json
+import os
 import re
 import shutil
+import socket
+import subprocess
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +21,8 @@ import pytest
 
 from daq.importers import import_folder
 from daq.service.settings import RigSettings
+from identify.parameters import Estimate
+from identify.report.words import estimate
 from tests.service_data import make_folder
 from tests.service_live import Running, running
 
@@ -26,6 +34,7 @@ RIGS = {
 }
 OWN = re.compile(r"(http|ws)://127\.0\.0\.1:|blob:http://127\.0\.0\.1:|data:")
 VIEWS = ("live", "new", "history", "jobs", "rigs", "admin")
+ROOT = Path(__file__).resolve().parents[1]
 SECONDS = 1000  # Playwright counts in milliseconds
 
 
@@ -85,6 +94,8 @@ def test_a_campaign_from_the_form_to_the_verdict(page: Any, server: Running) -> 
     assert page.locator("table tbody tr").count() == 9
     page.click("#startcampaign")
     page.wait_for_selector("text=campaign complete", timeout=90 * SECONDS)
+    assert page.locator("section.past[aria-label=Spectrum]").count() == 1
+    assert page.locator("section.past[aria-label=Tongue]").count() == 0
     assert page.locator("svg[aria-label^='Lock-in tongue'] circle").count() >= 3
     assert "free run: 169.7" in page.inner_text(".log")
     page.click("text=open the campaign")
@@ -93,7 +104,7 @@ def test_a_campaign_from_the_form_to_the_verdict(page: Any, server: Running) -> 
     page.click("#diagnose")
     page.wait_for_selector("#verdict", timeout=120 * SECONDS)
     assert page.get_attribute("#verdict", "data-verdict") == "no_discrepancy"
-    shown = page.inner_text("section[aria-label='Error before and after']")
+    shown = page.inner_text("section[aria-label=Error]")
     with server.client() as client:
         (campaign,) = [c for c in client.get("/campaigns").json()["items"] if c["rig"] == "quick"]
         (job,) = client.get("/jobs", params={"kind": "diagnosis"}).json()["items"]
@@ -101,6 +112,12 @@ def test_a_campaign_from_the_form_to_the_verdict(page: Any, server: Running) -> 
     assert (campaign["status"], campaign["verdict"]) == ("complete", "no_discrepancy")
     assert answer["verdict"] == "no_discrepancy"
     assert f"{answer['after']['chi2_per_dof']:.4g}" in shown
+    assert f"{100 * answer['after']['validation_error']:.3g} %" in shown
+    # what nothing was added to is shown once
+    for heading in ("Residual", "Parameters"):
+        assert page.locator(f"section[aria-label^={heading}]").count() == 1
+    assert "flame input w (µm)" in page.inner_text("section[aria-label=Nonlinearity]")
+    assert "m⁻²" in page.inner_text("section[aria-label=Parameters]")
     with page.expect_popup() as caught:
         page.click("text=Report")
     caught.value.wait_for_selector("text=validation")
@@ -170,6 +187,12 @@ def test_stop_button_is_in_reach_on_every_view_and_small_screens(
         assert box["height"] >= 40
         wide = page.evaluate("document.documentElement.scrollWidth")
         assert wide <= 391, f"{place} scrolls sideways: {wide}"
+        hidden = page.evaluate(
+            """() => [...document.querySelectorAll('main button, main td')].filter(
+              e => e.checkVisibility() && e.getBoundingClientRect().right > innerWidth)
+              .map(e => e.textContent)"""
+        )
+        assert hidden == [], place
 
 
 def test_keys_and_the_audit_trail(page: Any, server: Running) -> None:
@@ -277,6 +300,104 @@ def test_text_stands_out_in_both_themes(page: Any, theme: str) -> None:
           return out; }"""
     )
     assert {pair: ratio for pair, ratio in ratios.items() if ratio < 4.5} == {}
+
+
+def test_numbers_are_written_as_in_the_report(page: Any) -> None:
+    pairs = [
+        *((168.79, 4.9e-5), (35.2, 0.0021), (0.0099774, 3.2e-5), (-1.252e7, 25000.0)),
+        *((1e-7, 0.0068), (-3.1, 40.0), (5.0, 0.0), (2.5e-6, 1e-9)),
+    ]
+    wanted = [estimate(Estimate(value, stderr, "m^-2")) for value, stderr in pairs]
+    shown = page.evaluate(
+        """async (pairs) => { const { withError, unit } = await import('/js/dom.js');
+          return pairs.map(([v, e]) => `${withError(v, e)} ${unit('m^-2')}`); }""",
+        pairs,
+    )
+    assert shown == wanted
+
+
+def test_the_last_place_asked_for_is_shown(page: Any, server: Running) -> None:
+    go(page, server, "live", "h1")
+    late: list[Any] = []
+    page.route(re.compile("/api/v1/campaigns"), lambda route: late.append(route))
+    page.click("nav >> text=History")
+    page.wait_for_selector("text=loading")
+    page.click("nav >> text=Rigs")
+    page.wait_for_selector("h1:has-text('Rigs')")
+    assert page.evaluate("getComputedStyle(document.activeElement).outlineStyle") == "none"
+    with page.expect_response(re.compile("/api/v1/campaigns")):
+        late[0].continue_()
+    page.wait_for_timeout(200)
+    assert page.inner_text("h1") == "Rigs"
+    go(page, server, "nonsense", "text=This page has no view «nonsense».")
+    assert page.title() == "No such view · entrain"
+
+
+def test_a_pause_and_an_end_are_seen(page: Any, server: Running) -> None:
+    plan = {"record_s": 1.0, "criterion_db": 40, "conditions": [{"offset": -0.04}] * 4}
+    go(page, server, "live/slow", "text=Live: slow")
+    with server.client() as client:
+        answer = client.post("/campaigns", json={"rig": "slow", "plan": plan})
+        assert answer.status_code == 202, answer.text
+    page.wait_for_selector("text=entrained when at least 40 dB below", timeout=60 * SECONDS)
+    assert page.is_disabled("button:text-is('Resume')")
+    page.click("button:text-is('Pause')")
+    page.wait_for_selector(".chip:text-is('paused')", timeout=20 * SECONDS)
+    page.wait_for_selector("[role=log]:has-text('paused: the speaker is silent')")
+    page.wait_for_selector("section.past[aria-label=Levels]")
+    assert page.is_disabled("button:text-is('Pause')")
+    page.click("button:text-is('Resume')")
+    page.wait_for_selector("section[aria-label=Levels]:not(.past)", timeout=20 * SECONDS)
+    page.wait_for_selector(".chip:text-is('running')")
+    page.click("text=End campaign")
+    page.wait_for_selector("text=campaign stopped", timeout=20 * SECONDS)
+    page.wait_for_selector(".chip:text-is('idle')")
+    page.wait_for_selector("section.past[aria-label=Levels]")
+    assert float(page.get_attribute("progress", "value") or 0) < 0.5
+
+
+@contextmanager
+def served(folder: Path, port: int) -> Iterator[None]:
+    """`entrain serve` in a process of its own, with a rig in real time."""
+    environment = os.environ | {
+        "ENTRAIN_DATA_DIR": str(folder),
+        "ENTRAIN_RIGS": json.dumps({"slow": RIGS["slow"].model_dump()}),
+        "ENTRAIN_LOG__LEVEL": "error",
+    }
+    command = [sys.executable, "-m", "daq.cli", "serve", "--port", str(port)]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, cwd=ROOT, env=environment) as process:
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+def test_a_service_that_died_and_returned_is_another_one(browser: Any, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    url = f"http://127.0.0.1:{port}"
+    page = browser.new_page()
+    with served(tmp_path, port):
+        while True:
+            with suppress(httpx.TransportError):
+                httpx.get(f"{url}/api/v1/health", trust_env=False)
+                break
+        page.goto(f"{url}/#live/slow")
+        page.wait_for_selector("#connection.good", timeout=20 * SECONDS)
+        httpx.post(f"{url}/api/v1/campaigns", json={"rig": "slow"}, trust_env=False)
+        page.wait_for_selector("[role=meter][aria-label^='p1']", timeout=20 * SECONDS)
+    page.wait_for_selector("#banner:has-text('Connection lost at')", timeout=20 * SECONDS)
+    page.evaluate("location.hash = 'history'")
+    page.wait_for_selector("h1:has-text('Not possible')")
+    assert page.title() == "Not possible · entrain"
+    with served(tmp_path, port):
+        page.wait_for_selector("h1:has-text('History')", timeout=60 * SECONDS)
+        page.evaluate("location.hash = 'live/slow'")
+        page.wait_for_selector("text=No signal: start a campaign, or watch.")
+        page.wait_for_selector(".chip:text-is('idle')")
+        assert page.is_disabled("button:text-is('Pause')")
+    page.close()
 
 
 def test_a_lost_connection_is_said_and_found_again(browser: Any, tmp_path: Path) -> None:

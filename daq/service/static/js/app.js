@@ -16,11 +16,16 @@ import run from "./views/run.js";
 
 const routes = { live, new: plan, history: history_, campaign, run, jobs, rigs, result, admin };
 const main = document.getElementById("main");
-let leave = null;
+let leave = null, asked = 0, failed = false;
+
+async function nowhere(name) {
+  return { title: "No such view", content: h("p", {}, `This page has no view «${name}». `, h("a", { href: "#live" }, "To Live")) };
+}
 
 async function show() {
+  const turn = ++asked;
   const [name, ...rest] = decodeURI(location.hash.slice(1) || "live").split("/");
-  const view = routes[name] || live;
+  const view = Object.hasOwn(routes, name) ? routes[name] : () => nowhere(name);
   for (const link of document.querySelectorAll("nav a")) {
     if (link.getAttribute("href") === `#${name}`) link.setAttribute("aria-current", "page");
     else link.removeAttribute("aria-current");
@@ -28,14 +33,18 @@ async function show() {
   if (leave) leave();
   leave = null;
   main.replaceChildren(h("p", { class: "soft" }, "loading …"));
+  let found;
   try {
-    const { title, content, close } = await view(rest.map(decodeURIComponent));
-    main.replaceChildren(h("h1", {}, title), ...[].concat(content));
-    document.title = `${title} · entrain`;
-    leave = close || null;
+    found = await view(rest.map(decodeURIComponent));
   } catch (error) {
-    main.replaceChildren(h("h1", {}, "Not possible"), h("p", { class: "bad", role: "alert" }, error.message));
+    found = { title: "Not possible", content: h("p", { class: "bad", role: "alert" }, error.message), error };
   }
+  // A slow answer may come when another view has been asked for.
+  if (turn !== asked) { found.close?.(); return; }
+  main.replaceChildren(h("h1", {}, found.title), ...[].concat(found.content));
+  document.title = `${found.title} · entrain`;
+  leave = found.close || null;
+  failed = Boolean(found.error);
 }
 
 export async function stopAll() {
@@ -72,6 +81,7 @@ stream.on("connection", ({ state, lostAt }) => {
   banner.textContent = lost ? `Connection lost at ${lostAt.toLocaleTimeString()}: what you see is old. A campaign goes on without this page; STOP may not reach it.` : "";
   document.body.classList.toggle("stale", lost);
 });
+stream.on("resumed", () => { if (failed) show(); });
 stream.on("emergency_stop", (event) => toast(`Emergency stop by ${event.data.who}: ${event.data.rigs.join(", ")}`, true));
 stream.on("control", (event) => { if (event.data.previous && event.data.holder !== event.data.previous) toast(`Control of ${event.data.rig}: ${event.data.holder || "free"}`); });
 stream.on("dropped", (event) => toast(`This page lagged: ${event.data.dropped} events were left out`, true));

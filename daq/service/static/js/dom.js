@@ -29,16 +29,37 @@ export function num(value, digits = 4) {
   return String(Number(value.toPrecision(digits)));
 }
 
+// a relative error
+export const percent = (value) => (Number.isFinite(value) ? `${num(100 * value, 3)} %` : "–");
+
+// m⁻² for m^-2, nothing for 1
+export function unit(name) {
+  return name === "1" ? "" : name.replace(/\^(-?\d+)/g, (_, power) => [...power].map((c) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]).join(""));
+}
+
+// A value to the second digit of its standard error, both with one exponent: as the report writes it.
+export function withError(value, stderr) {
+  if (!Number.isFinite(value)) return "—";
+  if (!Number.isFinite(stderr)) return `${num(value, 4)} ± not determined`;
+  if (stderr <= 0) return `${num(value, 6)} ± 0`;
+  const magnitude = Math.floor(Math.log10(Math.max(Math.abs(value), stderr)));
+  const last = Math.floor(Math.log10(stderr)) - 1;  // decimal place of the error's second digit
+  const plain = magnitude >= -4 && magnitude <= 5;
+  const places = Math.min(100, Math.max(0, (plain ? 0 : magnitude) - last));
+  const written = (x) => (plain ? x.toFixed(places) : `${(x / 10 ** magnitude).toFixed(places)}e${magnitude}`);
+  return `${written(value)} ± ${written(stderr)}`.replaceAll("-", "−");
+}
+
 // a probability; what is too small for a double is said so
 export function chance(p) { return p !== null && p < 1e-300 ? "< 1e-300" : num(p, 3); }
 
 export function table(caption, head, rows, { pick, numeric = [], empty = "nothing yet" } = {}) {
   const body = rows.map((row, i) => {
-    const cells = row.map((cell, k) => h("td", { class: numeric.includes(k) ? "n" : null }, cell ?? "–"));
+    const cells = row.map((cell, k) => h("td", { class: numeric.includes(k) ? "n" : null, "data-head": head[k] || null }, cell ?? "–"));
     return h("tr", {}, cells);
   });
   return h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": caption || "table" },
-    h("table", {}, caption ? h("caption", {}, caption) : null,
+    h("table", { class: "rows" }, caption ? h("caption", {}, caption) : null,
       head.some(Boolean) && h("thead", {}, h("tr", {}, head.map((text, k) => h("th", { scope: "col", class: numeric.includes(k) ? "n" : null }, text)))),
       h("tbody", {}, body.length ? body : h("tr", {}, h("td", { colspan: String(head.length), class: "soft" }, empty)))));
 }

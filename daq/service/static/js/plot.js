@@ -38,6 +38,12 @@ export class Curves {
     }, this.data, this.root);
   }
   resize() { if (this.root.clientWidth && (!this.plot || Math.abs(this.plot.width - this.root.clientWidth) > 2)) this.rebuild(); }
+  // name what the ordinate counts in
+  measure(y) {
+    if (y === this.options.y) return;
+    this.options.y = y;
+    if (this.plot) this.rebuild();
+  }
   set(data) {
     this.data = data;
     if (this.plot) this.plot.setData(data);
@@ -136,6 +142,7 @@ export class Portrait {
   constructor(label) {
     this.canvas = h("canvas", { class: "free", role: "img", "aria-label": label, height: 230 });
   }
+  clear() { this.canvas.getContext("2d").clearRect(0, 0, this.canvas.width, this.canvas.height); }
   draw(xs, ys, name, unit) {
     const { canvas } = this, width = canvas.clientWidth || 230, height = 230;
     const ratio = devicePixelRatio || 1;

@@ -8,7 +8,7 @@ export default async function jobs() {
   async function draw() {
     const { items } = await get("/jobs", { limit: 100 });
     list.replaceChildren(table("", ["created", "kind", "title", "by", "state", "progress", "actions"], items.map((job) => [
-      job.created.slice(0, 19).replace("T", " "), job.kind, job.title, job.owner, h("span", { class: job.state === "failed" ? "bad" : "" }, job.state + (job.error && job.state === "failed" ? `: ${job.error}` : "")),
+      job.created.slice(0, 19).replace("T", " "), job.kind, job.title, job.owner, h("span", { class: job.state === "failed" ? "bad" : "" }, (job.hold || job.state) + (job.error && job.state === "failed" ? `: ${job.error}` : "")),
       h("progress", { max: "1", value: String(job.progress), "aria-label": `progress of ${job.title}` }), actions(job)])));
   }
   function actions(job) {

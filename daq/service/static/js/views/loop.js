@@ -1,6 +1,6 @@
 // A closed loop: its rounds while they are made, and what they came to.
 import { get } from "../api.js";
-import { card, h, num, table } from "../dom.js";
+import { card, h, num, percent, table } from "../dom.js";
 import { reportLinks } from "./identification.js";
 
 const ENDINGS = {
@@ -28,5 +28,5 @@ export async function drawLoop(job) {
       last ? reportLinks({ "HTML report": `/close-loops/${job.id}/report`, JSON: `/jobs/${job.id}/result` }) : ""),
     card("", "Rounds", table("Error before and after, by round", ["#", "campaign", "runs", "verdict", "effects", "rivals", "χ²/dof", "validation error"], closed.rounds.map((one) => [
       one.number, h("a", { href: `#campaign/${one.campaign}` }, one.campaign), one.runs, one.verdict, one.effects.join(", "), one.rivals.join(", "),
-      `${num(one.before.chi2_per_dof, 4)} → ${num(one.after.chi2_per_dof, 4)}`, `${num(one.before.validation_error, 3)} → ${num(one.after.validation_error, 3)}`]), { numeric: [0, 2, 6, 7] })));
+      `${num(one.before.chi2_per_dof, 4)} → ${num(one.after.chi2_per_dof, 4)}`, `${percent(one.before.validation_error)} → ${percent(one.after.validation_error)}`]), { numeric: [0, 2, 6, 7] })));
 }

@@ -3,8 +3,6 @@ import { attempt, download, get } from "../api.js";
 import { card, h, num } from "../dom.js";
 import { Curves } from "../plot.js";
 
-const COLOURS = ["--c1", "--c2", "--c3", "--c4"];
-
 export default async function run([campaign, name]) {
   const base = `/campaigns/${campaign}/runs/${encodeURIComponent(name)}`;
   const facts = await get(base);
@@ -14,8 +12,8 @@ export default async function run([campaign, name]) {
   const wave = new Curves({ label: "Waveform, drag to zoom", x: "time (s)", y: "", height: 260, series: [{ label: "smallest", colour: "--c1" }, { label: "largest", colour: "--c1" }], bands: [{ series: [2, 1] }], onZoom: (a, b) => zoom(a, b) });
   let from = 0, to = facts.samples;
   const rate = facts.sample_rate_hz;
-  const spectrum = new Curves({ label: "Amplitude spectrum of what is in view", x: "frequency (Hz)", y: "dB", height: 260, series: [{ label: "amplitude", colour: "--c2" }],
-    marks: () => facts.frequency_hz ? [{ x: facts.frequency_hz, label: "forcing", colour: "--c3" }] : [] });
+  const spectrum = new Curves({ label: "Amplitude spectrum of what is in view", x: "frequency (Hz)", y: "", height: 260, series: [{ label: "amplitude", colour: "--c2" }],
+    marks: () => facts.frequency_hz ? [{ x: facts.frequency_hz, label: "forcing", colour: "--c4" }] : [] });
 
   function zoom(a, b) { from = Math.max(0, Math.round(a * rate)); to = Math.min(facts.samples, Math.max(from + 8, Math.round(b * rate))); draw(); }
   function move(share) { const width = to - from, by = Math.round(share * width); from = Math.min(facts.samples - width, Math.max(0, from + by)); to = from + width; draw(); }
@@ -26,6 +24,8 @@ export default async function run([campaign, name]) {
       const [band, lines] = await Promise.all([
         get(`${base}/envelope`, { start: from, stop: to, points: 1200 }),
         get(`${base}/spectrum`, { start: from, stop: to, channel, max_hz: Math.min(rate / 2, 1500), points: 3000 })]);
+      wave.measure(band.units[channel]);
+      spectrum.measure(`dB re 1 ${band.units[channel]}`);
       wave.set([band.time_s, band.channels[channel].min, band.channels[channel].max]);
       spectrum.set([lines.frequency_hz, lines.channels[channel].map((v) => 20 * Math.log10(Math.max(v, 1e-12)))]);
       inView.textContent = `${num(from / rate, 6)} s to ${num(to / rate, 6)} s, in ${band.units[channel]}; ${band.frames_per_bin === 1 ? "every sample" : `${band.frames_per_bin} samples a point`}; spectrum lines ${num(lines.resolution_hz, 3)} Hz apart`;
