@@ -131,6 +131,7 @@ def test_live_view_and_escape_stops(page: Any, server: Running) -> None:
     page.wait_for_selector("[role=meter][aria-label^='p1']", timeout=20 * SECONDS)
     page.keyboard.press("Escape")
     page.wait_for_selector("text=stopped by local", timeout=20 * SECONDS)
+    page.wait_for_selector("section.past[aria-label=Levels]", timeout=20 * SECONDS)
     with server.client() as client:
         rig = client.get("/rigs/slow").json()
         assert (rig["state"], rig["stopped_by"]) == ("stopped", "local")
