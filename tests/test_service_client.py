@@ -63,7 +63,7 @@ def test_every_route_is_documented() -> None:
 
 
 @pytest.mark.parametrize("keyed", [False, True])
-def test_the_page_s_commands_work_as_printed(tmp_path: Path, keyed: bool) -> None:
+def test_printed_commands_work(tmp_path: Path, keyed: bool) -> None:
     lines = [line.strip() for line in document.page().splitlines() if line.startswith("    ")]
     given = [line for line in lines if line.startswith("export")]
     asked = next(line for line in lines if line.endswith('"$ENTRAIN/me"'))
