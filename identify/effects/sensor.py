@@ -91,7 +91,8 @@ class ChannelMismatch(Effect):
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         small = tuple(p.scale for p in self.parameters)
         if "gain" in self.form:  # as of another range of a preamplifier
-            return [small, *((gain, *small[1:]) for gain in (-0.65, -0.35, 0.5, 1.5, 4.0))]
+            gains = (-0.65, -0.35, -0.03, 0.03, 0.5, 1.5, 4.0)  # 3 %: as of two microphones unlike
+            return [small, *((gain, *small[1:]) for gain in gains)]
         if self.form != "skew":
             return [small]
         # a delay of either, as of a converter that began later
