@@ -6,7 +6,9 @@ linear function of covariates, one, two or three at a time, span L ⊂ S. Where 
 
     (|P_L r|² / dim L) / ((|P_S r|² − |P_L r|²) / (dim S − dim L)) ~ F(dim L, dim S − dim L),
 
-however large the spread is: a law takes more than its share.
+however large the spread is: a law takes more than its share. What the parameters absorb nearly is
+left out of S: such a direction holds noise, which a law that leaves nothing of the deviations would
+be measured by.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +22,7 @@ from identify.chances import f_tail
 FloatArray = npt.NDArray[np.float64]
 
 LAW_P = 0.002  # a law less probable than this by chance is one
+SEEN = 0.5  # of a standard deviation of r that deviations must make in a direction to be seen there
 
 
 @dataclass(frozen=True)
@@ -43,7 +46,7 @@ def law_in(
     Parameters
     ----------
     residual : (n,), whitened by noise and spread; jacobian : (n, p), by the fitted parameters.
-    deviations : (n, m, q), the tangents of m runs' q deviations.
+    deviations : (n, m, q), what m runs' q deviations of one standard deviation do to r.
     covariates : (m,) each; groups : names of those that a law may join.
     """
     base = _span(jacobian)
@@ -51,7 +54,8 @@ def law_in(
     n, m, q = deviations.shape
     flat = deviations.reshape(n, -1)
     free = (flat - base @ (base.T @ flat)).reshape(n, m, q)
-    whole = _span(free.reshape(n, -1))
+    U, S, _ = np.linalg.svd(free.reshape(n, -1), full_matrices=False)
+    whole = U[:, SEEN < S]
     total, room = float(np.sum((whole.T @ rest) ** 2)), whole.shape[1]
     if not total > 0:
         return None
@@ -59,7 +63,8 @@ def law_in(
     for names in groups:
         columns = np.stack([_standard(covariates[name]) for name in names], axis=1)
         for which in [*((j,) for j in range(q)), *([tuple(range(q))] if q > 1 else [])]:
-            law = _span(np.concatenate([free[:, :, j] @ columns for j in which], axis=1))
+            along = np.concatenate([free[:, :, j] @ columns for j in which], axis=1)
+            law = whole @ _span(whole.T @ along)
             size = law.shape[1]
             if 0 < size < room:
                 taken = float(np.sum((law.T @ rest) ** 2))

@@ -369,7 +369,7 @@ def _objection(rows: Sequence[_Rows], sizes: FloatArray, scatter: Scatter) -> tu
         return NOTHING, 0.0
     residual, jacobian = _whitened(rows, sizes)
     forced_runs = np.concatenate([np.full(r.batch.runs, not r.batch.free) for r in rows])
-    deviations = _tangents(rows, sizes, there)[:, forced_runs]
+    deviations = _tangents(rows, sizes, there)[:, forced_runs] * sizes[there]
     if scatter.wanders:  # what wanders follows by chance what goes with the time
         trends = np.stack([known["time"], known["time" + SQUARED]], axis=1)
         slow = np.einsum("nmq,mk->nqk", deviations, trends).reshape(residual.size, -1)
