@@ -1,6 +1,7 @@
 """The whole bench without a sound card: plant behind serial packets, generator over TCP, amplifier
 on a serial line, measured by our own drivers as one composed rig. And what overload does."""
 
+import sys
 import threading
 import time
 from dataclasses import replace
@@ -17,7 +18,7 @@ from drivers.stepped_output import SteppedOutput
 from drivers.types import OutputLimits, Tone
 from drivers.visa_generator import open_generator
 from simulated_rig import build_config
-from simulated_rig.controllers import PhaseShifter
+from simulated_rig.controllers import Law, PhaseShifter
 from simulated_rig.hil import (
     Bench,
     Device,
@@ -80,11 +81,22 @@ class TestDevice:
         parts = [other.process(part) for part in np.split(drive, [1, 257, 258, 700])]
         np.testing.assert_array_equal(np.concatenate(parts), one.process(drive))
 
-    def test_a_controller_that_fails_ends_in_a_stated_fault_and_silence(self) -> None:
+    @pytest.mark.parametrize(
+        ("law", "says"),
+        [
+            (lambda p: float("nan"), "the controller's answer nan is not a finite voltage"),
+            (lambda p: None, "the controller's answer None is not a finite voltage"),
+            (lambda p: p[7], "the controller failed: IndexError"),
+            (sys.exit, "the controller failed: SystemExit"),
+        ],
+    )
+    def test_a_controller_that_fails_ends_in_a_stated_fault_and_silence(
+        self, law: Law, says: str
+    ) -> None:
         watch = Watch(PATIENT, 48000.0)
-        device = Device(QUIET, 48000.0, watch, controller=lambda p: float("nan"))
+        device = Device(QUIET, 48000.0, watch, controller=law)
         assert np.all(device.process(np.zeros(64)) == 0.0)
-        assert watch.fault == "plant failed: the controller's answer nan is not a finite voltage"
+        assert (watch.fault or "").startswith(f"plant failed: {says}")
         assert np.all(device.process(np.ones(64)) == 0.0)
 
 

@@ -73,19 +73,25 @@ class Device:
         start = time.perf_counter()
         try:
             out = self._advance(line_in_v)
-        except ValueError as error:
+        except Exception as error:
             self.watch.fail(f"plant failed: {error}")
             return np.zeros((frames, self._channels))
         self.watch.block(frames, time.perf_counter() - start)
         return out
 
     def _interruptible(self, law: Law) -> Law:
-        """`law`, given up in the middle of a block when a fault has been found meanwhile."""
+        """`law`, given up in the middle of a block when a fault has been found meanwhile.
+
+        Whatever it raises is an error of the plant's: its thread must not end without a fault.
+        """
 
         def guarded(pressure_pa: FloatArray) -> float:
             if self.watch.fault is not None:
                 raise ValueError(self.watch.fault)
-            return law(pressure_pa)
+            try:
+                return law(pressure_pa)
+            except (Exception, SystemExit) as error:
+                raise ValueError(f"the controller failed: {error!r}") from error
 
         return guarded
 

@@ -221,9 +221,7 @@ class PlantLoop:
                 one = slice(k, k + 1)
                 part = speaker[k * fine : (k + 1) * fine + 1]
                 self._run(part, noise[one], hiss[one], out[one], volts[one])
-                answer = float(law(out[k, 2:] + hiss[k]))
-                if not np.isfinite(answer):
-                    raise ValueError(f"the controller's answer {answer!r} is not a finite voltage")
+                answer = _volts(law(out[k, 2:] + hiss[k]))
                 self._held[0] = min(max(answer, -limit), limit)
         self.control_v = volts
         self.velocity_m_s = out[:, 0]
@@ -294,6 +292,17 @@ class PlantLoop:
             volts,
         )
         self._step += out.shape[0] * self.substeps
+
+
+def _volts(answer: object) -> float:
+    """A controller's answer; raises `ValueError` for what is no voltage."""
+    try:
+        volts = float(answer)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        volts = np.nan
+    if not np.isfinite(volts):
+        raise ValueError(f"the controller's answer {answer!r} is not a finite voltage")
+    return volts
 
 
 def silent(config: RigConfig) -> RigConfig:
