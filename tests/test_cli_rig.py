@@ -111,6 +111,27 @@ def test_check_finds_the_simulated_rig_fit(
         (("identify", "/nowhere"), "/nowhere"),
         (("diagnose", "nothing"), "nothing"),
         (("characterise", "absent.txt"), "absent.txt"),
+        (("characterise", "absent.txt", "--rate-hz", "nan"), "'--rate-hz': nan is not a finite"),
+        (("characterise", "absent.txt", "--figure", "x.exe"), "'x.exe' does not end in .png"),
+        (("characterise", "absent.txt", "--figure", "/nope/x.png"), "/nope does not exist"),
+        (("campaign", "design", "nothing", "--out", "/nope/x.toml"), "/nope does not exist"),
+        (("reproduce", "--out", "/etc/hostname"), "'/etc/hostname' is a file"),
+        (("demo", "--out", "/etc/hostname/x"), "'/etc/hostname' is a file"),
+        (
+            ("campaign", "dry-run", "--free-hz", "inf"),
+            "'--free-hz': inf is not a finite number > 0",
+        ),
+        (
+            ("campaign", "dry-run", "--free-hz", "-5"),
+            "'--free-hz': -5.0 is not a finite number > 0",
+        ),
+        (("campaign", "design", "x", "--out", "y.toml", "--minutes", "nan"), "--minutes"),
+        (("close-loop", "--minutes", "nan"), "--minutes"),
+        (("check", "--frequency-hz", "nan"), "--frequency-hz"),
+        (("hil", "--seconds", "nan"), "'--seconds': nan is not a finite number > 0"),
+        (("hil", "--seconds", "-1"), "'--seconds': -1.0 is not a finite number > 0"),
+        (("hil", "--gain", "nan"), "--gain"),
+        (("keys", "create", "x", "--expires", "99999999999y"), "--expires='99999999999y' is more"),
     ],
 )
 def test_what_is_not_possible_says_so(

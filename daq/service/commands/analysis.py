@@ -15,12 +15,14 @@ from daq.errors import InputError
 from daq.service import LONGEST_SEARCH_S
 from daq.service.commands import broadband
 from daq.service.commands.common import (
+    FigureOption,
     HtmlOption,
     JsonOption,
     StoreOption,
     number,
     open_store,
     out,
+    positive,
     table,
     write_json,
 )
@@ -321,12 +323,10 @@ def characterise(
         list[str] | None, typer.Option(help="Name of each signal column, in order.")
     ] = None,
     rate_hz: Annotated[
-        float | None, typer.Option(help="Sample rate where the file has none.")
+        float | None, typer.Option(help="Sample rate where the file has none.", callback=positive)
     ] = None,
     json_: JsonOption = None,
-    figure: Annotated[
-        Path | None, typer.Option(help="Also write a figure (.png, .svg, .pdf).")
-    ] = None,
+    figure: FigureOption = None,
 ) -> None:
     """Regime, frequency, amplitude, harmonics, growth rate of an unforced oscillation."""
     from daq.service.words import read_unforced

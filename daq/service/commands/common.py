@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 out = Console(highlight=False, emoji=False)
 err = Console(stderr=True, highlight=False, emoji=False)
 
+FIGURES = (".png", ".svg", ".pdf")
 StoreOption = Annotated[
     Path | None, typer.Option("--store", help="Run store; else the configured one.")
 ]
@@ -34,7 +36,39 @@ def _writable(place: Path | None) -> Path | None:
     if place.is_dir() or not place.parent.is_dir():
         what = "a folder" if place.is_dir() else f"in no folder: {place.parent} does not exist"
         raise typer.BadParameter(f"{str(place)!r} is {what}; give a file in a folder that exists")
+    if not os.access(place if place.exists() else place.parent, os.W_OK):
+        raise typer.BadParameter(f"{str(place)!r} may not be written; give another place")
     return place
+
+
+def _drawable(place: Path | None) -> Path | None:
+    """Refuse a figure of another format than we draw, too."""
+    if place is not None and place.suffix.lower() not in FIGURES:
+        raise typer.BadParameter(f"{str(place)!r} does not end in {', '.join(FIGURES)}")
+    return _writable(place)
+
+
+def folder_to_be(place: Path) -> Path:
+    """Refuse what cannot become a folder before the work whose results it is for."""
+    above = next(one for one in (place, *place.absolute().parents) if one.exists())
+    if not above.is_dir() or not os.access(above, os.W_OK):
+        what = "may not be written to" if above.is_dir() else "is a file"
+        raise typer.BadParameter(f"{str(above)!r} {what}; give a folder, or where one can be made")
+    return place
+
+
+def finite(value: float | None) -> float | None:
+    """Refuse NaN and infinity, which are numbers to the parser."""
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number")
+    return value
+
+
+def positive(value: float | None) -> float | None:
+    """Refuse what is no finite number above zero."""
+    if value is not None and not 0 < value < math.inf:
+        raise typer.BadParameter(f"{value} is not a finite number > 0")
+    return value
 
 
 JsonOption = Annotated[
@@ -44,6 +78,13 @@ JsonOption = Annotated[
 HtmlOption = Annotated[
     Path | None,
     typer.Option("--html", help="Also write a self-contained HTML report.", callback=_writable),
+]
+FigureOption = Annotated[
+    Path | None,
+    typer.Option("--figure", help="Also write a figure (.png, .svg, .pdf).", callback=_drawable),
+]
+PlanOption = Annotated[
+    Path, typer.Option("--out", help="Where the plan goes; - for stdout.", callback=_writable)
 ]
 
 

@@ -6,7 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.markup import escape
 
-from daq.service.commands.common import StoreOption, number, open_store, out, table
+from daq.service.commands.common import (
+    StoreOption,
+    number,
+    open_store,
+    out,
+    positive,
+    table,
+)
 
 if TYPE_CHECKING:
     from daq.records import CampaignCard
@@ -37,7 +44,7 @@ def import_(
         list[str] | None, typer.Option(help="Column number (from 0) or name of each channel.")
     ] = None,
     rate_hz: Annotated[
-        float | None, typer.Option(help="Sample rate where the file has none.")
+        float | None, typer.Option(help="Sample rate where the file has none.", callback=positive)
     ] = None,
     kind: Annotated[str, typer.Option(help="free, forced or cold.")] = "free",
     frequency_hz: Annotated[float | None, typer.Option(help="Forcing frequency.")] = None,

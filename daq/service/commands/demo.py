@@ -8,13 +8,16 @@ import typer
 
 from daq.service import LONGEST_SEARCH_S
 from daq.service.commands.analysis import ProcessesOption, progress_bar, show_diagnosis
-from daq.service.commands.common import number, out, write_json
+from daq.service.commands.common import folder_to_be, number, out, write_json
 
 
 def demo(
     seed: Annotated[int, typer.Option(min=0, help="Draws the effect, and all noise.")] = 0,
     folder: Annotated[
-        Path, typer.Option("--out", help="Where runs, report.html and diagnosis.json go.")
+        Path,
+        typer.Option(
+            "--out", help="Where runs, report.html and diagnosis.json go.", callback=folder_to_be
+        ),
     ] = Path("entrain-demo"),
     processes: ProcessesOption = 0,
 ) -> None:

@@ -1,20 +1,28 @@
 """`entrain campaign design`: the conditions that fix a model's parameters best, as a plan."""
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from daq.service.commands.analysis import CampaignArgument, load, progress_bar, show_quality
-from daq.service.commands.common import StoreOption, number, out, table, write_json
+from daq.service.commands.common import (
+    PlanOption,
+    StoreOption,
+    finite,
+    number,
+    out,
+    table,
+    write_json,
+)
 
 
 def design(
     campaign: CampaignArgument,
-    plan: Annotated[Path, typer.Option("--out", help="Where the plan goes; - for stdout.")],
+    plan: PlanOption,
     runs: Annotated[int, typer.Option(min=1, max=100, help="At most so many conditions.")] = 10,
     minutes: Annotated[
-        float | None, typer.Option(min=0.1, help="At most so much rig time; else as it takes.")
+        float | None,
+        typer.Option(min=0.1, help="At most so much rig time; else as it takes.", callback=finite),
     ] = None,
     store: StoreOption = None,
 ) -> None:

@@ -14,7 +14,7 @@ import typer
 from rich.live import Live
 from rich.text import Text
 
-from daq.service.commands.common import JsonOption, out, write_json
+from daq.service.commands.common import JsonOption, finite, out, positive, write_json
 
 if TYPE_CHECKING:
     from simulated_rig.controllers import LinearController
@@ -26,7 +26,9 @@ WIRES = "for the other side: ALSA_CONFIG_PATH={} with device rig_daq (out) and r
 def hil(
     preset: Annotated[str, typer.Option(help="Which tube.")] = "thesis-two-mode",
     seed: Annotated[int, typer.Option(min=0, help="Of all noise.")] = 0,
-    seconds: Annotated[float | None, typer.Option(help="How long; else until Ctrl-C.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="How long; else until Ctrl-C.", callback=positive)
+    ] = None,
     input_: Annotated[
         str | None, typer.Option("--input", help="Sound device that carries the speaker's signal.")
     ] = None,
@@ -34,7 +36,9 @@ def hil(
         str | None, typer.Option(help="Sound device that the microphones' signals go to.")
     ] = None,
     api: Annotated[str, typer.Option(help="Host API of the sound devices.")] = "ALSA",
-    latency: Annotated[float, typer.Option(help="Of the sound devices, in seconds.")] = 0.05,
+    latency: Annotated[
+        float, typer.Option(help="Of the sound devices, in seconds.", callback=positive)
+    ] = 0.05,
     sound_server: Annotated[
         bool, typer.Option(help="Without a sound card: start a private sound server for both.")
     ] = False,
@@ -48,9 +52,14 @@ def hil(
         str | None, typer.Option(help="MODULE:FUNCTION, pressures (Pa) to volts, in the loop.")
     ] = None,
     gain: Annotated[
-        float | None, typer.Option(help="Or the phase shifter of Fig. 1.4 with this gain (V/Pa).")
+        float | None,
+        typer.Option(
+            help="Or the phase shifter of Fig. 1.4 with this gain (V/Pa).", callback=finite
+        ),
     ] = None,
-    phase_deg: Annotated[float, typer.Option(help="Phase of the phase shifter.")] = 285.0,
+    phase_deg: Annotated[
+        float, typer.Option(help="Phase of the phase shifter.", callback=finite)
+    ] = 285.0,
     json_: JsonOption = None,
 ) -> None:
     """Run the plant in real time, behind sound devices or a serial board, until Ctrl-C.

@@ -10,6 +10,7 @@ from daq.service.commands.common import config_file, out, table
 from daq.service.keys import InvalidKey, KeyStore, utc_now
 
 app = typer.Typer(help="API keys of the service.", no_args_is_help=True)
+LONGEST_DAYS = 36_500  # as the API takes it
 UNITS = {"h": 1 / 24, "d": 1.0, "w": 7.0, "y": 365.0}
 
 
@@ -24,7 +25,10 @@ def duration(text: str) -> timedelta:
     match = re.fullmatch(r"(\d+)([hdwy])", text)
     if match is None:
         raise InvalidKey(f"--expires={text!r} is not a time like 12h, 30d, 8w or 1y")
-    return timedelta(days=int(match[1]) * UNITS[match[2]])
+    days = int(match[1]) * UNITS[match[2]]
+    if days > LONGEST_DAYS:
+        raise InvalidKey(f"--expires={text!r} is more than {LONGEST_DAYS // 365}y; or give never")
+    return timedelta(days=days)
 
 
 @app.command("create")

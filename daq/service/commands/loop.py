@@ -9,6 +9,7 @@ from daq.service.commands.common import (
     HtmlOption,
     JsonOption,
     StoreOption,
+    finite,
     number,
     open_store,
     out,
@@ -77,7 +78,9 @@ def close_loop(
         ),
     ] = False,
     rounds: Annotated[int, typer.Option(min=1, max=50, help="At most so many campaigns.")] = 4,
-    minutes: Annotated[float, typer.Option(min=0.0, help="At most so much rig time.")] = 60.0,
+    minutes: Annotated[
+        float, typer.Option(min=0.0, help="At most so much rig time.", callback=finite)
+    ] = 60.0,
     resume: Annotated[
         str | None, typer.Option(help="Go on with the loop that began with this campaign.")
     ] = None,

@@ -7,13 +7,13 @@ from typing import Annotated
 import typer
 
 from daq.service.commands.analysis import progress_bar
-from daq.service.commands.common import out
+from daq.service.commands.common import folder_to_be, out
 
 
 def reproduce(
-    folder: Annotated[Path, typer.Option("--out", help="Where reproduction.html goes.")] = Path(
-        "entrain-reproduction"
-    ),
+    folder: Annotated[
+        Path, typer.Option("--out", help="Where reproduction.html goes.", callback=folder_to_be)
+    ] = Path("entrain-reproduction"),
 ) -> None:
     """Make the thesis's tables and figures again, theirs beside ours, on one page.
 

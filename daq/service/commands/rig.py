@@ -19,6 +19,7 @@ from daq.service.commands.common import (
     number,
     open_store,
     out,
+    positive,
     table,
     write_json,
 )
@@ -108,7 +109,8 @@ def rehearse(
     plan: PlanArgument = None,
     rig: RigOption = None,
     free_hz: Annotated[
-        float | None, typer.Option(help="Limit cycle, to show relative frequencies.")
+        float | None,
+        typer.Option(help="Limit cycle, to show relative frequencies.", callback=positive),
     ] = None,
     store: StoreOption = None,
     json_: JsonOption = None,
@@ -350,9 +352,12 @@ def devices(json_: Annotated[bool, typer.Option("--json", help="As JSON.")] = Fa
 def check(
     rig: Annotated[str | None, typer.Argument(help="Configured rig.")] = None,
     level_v: Annotated[
-        float | None, typer.Option(help="Highest drive; else 2 % of the rig's limit.")
+        float | None,
+        typer.Option(help="Highest drive; else 2 % of the rig's limit.", callback=positive),
     ] = None,
-    frequency_hz: Annotated[float, typer.Option(help="Frequency of the test tone.")] = 170.0,
+    frequency_hz: Annotated[
+        float, typer.Option(help="Frequency of the test tone.", callback=positive)
+    ] = 170.0,
 ) -> None:
     """Look at a rig harmlessly, flame off: noise, margins, drive steps, round trip, silence."""
     from daq.campaign import FlameSwitch
