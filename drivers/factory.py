@@ -17,15 +17,16 @@ it is asked for, so that none needs another's library.
 """
 
 import functools
+import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Any, TypeVar
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from drivers.composed import ClosableInput, ComposedRig
 from drivers.errors import DriverError, SettingError
 from drivers.protocols import DuplexRig
 from drivers.stepped_output import SteppedOutput
-from drivers.types import Channel, OutputLimits, require_si
+from drivers.types import Channel, OutputLimits, is_number, require_si
 
 Options = Mapping[str, Any]
 T = TypeVar("T")
@@ -48,10 +49,11 @@ def open_device(driver: str, name: str, options: Options, *, isolate: bool = Fal
         raise SettingError(f"rig {name!r}: limits are missing: max_amplitude_v at least")
     for part, around in AROUND.items():
         if part in options:
-            try:
-                wrap = around(options[part])  # options are looked at before anything is opened
-            except (AttributeError, TypeError) as error:
-                raise SettingError(f"rig {name!r}: {part}: {error}") from error
+            if not isinstance(options[part], Mapping):
+                raise SettingError(f"rig {name!r}: {part}={options[part]!r} is not a table")
+            wrap = around(
+                f"rig {name!r}: {part}", options[part]
+            )  # options are looked at before anything is opened
             inner = {key: value for key, value in options.items() if key != part}
             rig = open_device(driver, name, inner, isolate=isolate)
             try:
@@ -64,25 +66,68 @@ def open_device(driver: str, name: str, options: Options, *, isolate: bool = Fal
 
         return IsolatedRig(functools.partial(open_device, driver, name, dict(options)))
     rest = {key: value for key, value in options.items() if key != "limits"}
-    try:
-        return maker(name, rest, OutputLimits(**options["limits"]))
-    except TypeError as error:
-        raise SettingError(f"rig {name!r}: {error}") from error
+    limits = made(OutputLimits, f"rig {name!r}: limits", options["limits"])
+    return maker(name, rest, limits)
 
 
-def channels_of(rows: Any) -> tuple[Channel, ...]:
+def known_options(maker: Callable[..., Any], where: str, table: Any, *taken: str) -> Options:
+    """A table of a configuration whose keys are parameters of `maker`, none of those `taken`;
+    raises `SettingError`."""
+    if not isinstance(table, Mapping):
+        raise SettingError(f"{where}={table!r} is not a table of options")
+    offered = [key for key in inspect.signature(maker).parameters if key not in taken]
+    if unknown := sorted(str(key) for key in set(table) - set(offered)):
+        raise SettingError(f"{where}: unknown options {', '.join(unknown)}; known: {offered}")
+    return table
+
+
+def made(maker: Callable[..., T], where: str, table: Any, **given: Any) -> T:
+    """`maker` called with a table of a configuration, its lists as the tuples that are wanted,
+    beside what is `given`; raises `SettingError` naming the option."""
+    plain = dict(known_options(maker, where, table, *given))
+    for key, wanted in inspect.signature(maker).parameters.items():
+        if key in plain:
+            plain[key] = value = tuple(plain[key]) if isinstance(plain[key], list) else plain[key]
+            if not _fits(value, wanted.annotation):
+                kind = getattr(wanted.annotation, "__name__", str(wanted.annotation))
+                raise SettingError(f"{where}: {key}={value!r} is not {WORDS.get(kind, kind)}")
+        elif wanted.default is wanted.empty and key not in given:
+            raise SettingError(f"{where}: {key} is missing")
+    return maker(**plain, **given)
+
+
+WORDS = {
+    "float": "a finite number",
+    "int": "a whole number",
+    "str": "text",
+    "bool": "true or false",
+}
+
+
+def _fits(value: object, annotation: Any) -> bool:
+    """Whether a plain value is of the type that a parameter wants, where that is a plain one."""
+    if get_origin(annotation) is Literal:
+        return value in get_args(annotation)
+    kinds = get_args(annotation) if isinstance(annotation, UnionType) else (annotation,)
+    if value is None or float in kinds:
+        return NoneType in kinds if value is None else is_number(value)
+    if isinstance(value, bool) and int in kinds:
+        return False
+    plain = tuple(kind for kind in kinds if kind in (int, str, bool))
+    return not plain or isinstance(value, plain)
+
+
+def settings_of(kind: Callable[..., T], name: str, options: Options) -> T:
+    """A settings dataclass from plain data."""
+    channels = channels_of(options.get("channels", ()), f"rig {name!r}: channels")
+    return made(kind, f"rig {name!r}", {"name": name, **options, "channels": channels})
+
+
+def channels_of(rows: Any, where: str = "channels") -> tuple[Channel, ...]:
     """Channels from tables of their fields."""
-    return tuple(require_si(Channel(**row)) for row in rows)
-
-
-def settings_of(kind: Callable[..., Any], name: str, options: Options) -> Any:
-    """A settings dataclass from plain data; lists become the tuples that it wants."""
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    if unknown := sorted(set(options) - known):
-        raise SettingError(f"rig {name!r}: unknown options {', '.join(unknown)}")
-    plain = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
-    plain["channels"] = channels_of(options.get("channels", ()))
-    return kind(**{"name": name, **plain})
+    if not isinstance(rows, list | tuple):
+        raise SettingError(f"{where}={rows!r} is not a list of tables")
+    return tuple(require_si(made(Channel, f"{where}[{i}]", row)) for i, row in enumerate(rows))
 
 
 def _sound_card(name: str, options: Options, limits: OutputLimits) -> DuplexRig:
@@ -106,7 +151,7 @@ def _composed(name: str, options: Options, limits: OutputLimits) -> DuplexRig:
     output = make_output(limits=limits)
     try:
         acquisition = make_input()
-    except (DriverError, TypeError):
+    except DriverError:
         output.close()
         raise
     return ComposedRig(name, acquisition, output)
@@ -116,11 +161,14 @@ def _part(
     name: str, part: str, options: Options, makers: Mapping[str, Callable[..., T]]
 ) -> Callable[..., T]:
     """The maker that the table `part` names, with the rest of the table as its arguments."""
-    table = dict(options.get(part, {}))
-    driver = table.pop("driver", None)
+    where, table = f"rig {name!r}: {part}", options.get(part, {})
+    if not isinstance(table, Mapping):
+        raise SettingError(f"{where}={table!r} is not a table of options")
+    driver = str(table.get("driver"))
     if driver not in makers:
-        raise SettingError(f"rig {name!r}: {part}.driver={driver!r} is not one of {sorted(makers)}")
-    return functools.partial(makers[driver], **table)
+        raise SettingError(f"{where}.driver={driver!r} is not one of {sorted(makers)}")
+    rest = {key: value for key, value in table.items() if key != "driver"}
+    return functools.partial(made, makers[driver], where, rest)
 
 
 def _microcontroller(address: str, channels: Any, baud: int = 115200) -> ClosableInput:
@@ -155,21 +203,23 @@ def _serial(address: str, limits: OutputLimits, baud: int = 115200) -> SteppedOu
 Around = Callable[[DuplexRig], DuplexRig]
 
 
-def _operated(flows: Mapping[str, Options]) -> Around:
+def _operated(where: str, flows: Mapping[str, Options]) -> Around:
     from drivers.operated import FlowSettings, OperatedRig
 
-    settings = {key: FlowSettings(**table) for key, table in flows.items()}
+    settings = {key: made(FlowSettings, f"{where}: {key}", table) for key, table in flows.items()}
     return lambda rig: OperatedRig(rig, {key: one.open() for key, one in settings.items()})
 
 
-def _interlocked(interlocks: Mapping[str, Options]) -> Around:
+def _interlocked(where: str, interlocks: Mapping[str, Options]) -> Around:
     from drivers.interlock import InterlockedRig, InterlockSettings
 
-    settings = {key: InterlockSettings(**table) for key, table in interlocks.items()}
+    settings = {
+        key: made(InterlockSettings, f"{where}: {key}", table) for key, table in interlocks.items()
+    }
     return lambda rig: InterlockedRig(rig, {key: one.open() for key, one in settings.items()})
 
 
-AROUND: dict[str, Callable[[Mapping[str, Options]], Around]] = {
+AROUND: dict[str, Callable[[str, Mapping[str, Options]], Around]] = {
     "interlocks": _interlocked,
     "flows": _operated,
 }

@@ -4,6 +4,7 @@ All values are SI. Samples are volts at the converter; `Channel.volts_per_unit` 
 the channel's own unit, and that division happens at analysis, so raw data stay raw.
 """
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -29,6 +30,11 @@ def require(condition: bool, parameter: str, value: object, requirement: str) ->
     """Raise `SettingError` naming parameter, value and requirement unless `condition` holds."""
     if not condition:
         raise SettingError(f"{parameter}={value!r} is not {requirement}")
+
+
+def is_number(value: object) -> bool:
+    """Whether it is a finite number; ``true`` is none, nor is text that looks like one."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 @dataclass(frozen=True)

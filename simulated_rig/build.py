@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import Literal
 
 from drivers.protocols import Clock
-from drivers.types import OutputLimits
+from drivers.types import OutputLimits, is_number, require
 from simulated_rig.clocks import RealClock, VirtualClock
 from simulated_rig.config import RigConfig, with_noise
 from simulated_rig.cycle import free_cycle
@@ -28,6 +28,12 @@ def build_config(
     """The rig of that name as data; see `build_rig`."""
     if preset not in PRESETS:
         raise ValueError(f"preset={preset!r} is not one of {sorted(PRESETS)}")
+    whole = isinstance(seed, int) and not isinstance(seed, bool)
+    require(whole and seed >= 0, "seed", seed, "a whole number >= 0")
+    sampled = is_number(sample_rate_hz) and 1000 <= sample_rate_hz <= 200_000
+    require(sampled, "sample_rate_hz", sample_rate_hz, "a rate from 1000 to 200000 Hz")
+    quiet = noise_db is None or (is_number(noise_db) and 0 <= noise_db <= 140)
+    require(quiet, "noise_db", noise_db, "a level from 0 to 140 dB")
     config = RigConfig(plant=PRESETS[preset](), sample_rate_hz=sample_rate_hz)
     if limits is not None:
         config = replace(config, limits=limits)
@@ -37,6 +43,8 @@ def build_config(
         effects = seal(seed)
     if isinstance(effects, SealedEffect):
         return effects.apply(config)
+    table = effects is None or isinstance(effects, Mapping)
+    require(table, "effects", effects, "a table of parameters by effect, or 'sealed'")
     for key, parameters in (effects or {}).items():
         config = make_effect(key, parameters).apply(config)
     return config
@@ -83,7 +91,8 @@ def build_rig(
     Raises
     ------
     ValueError
-        Unknown preset or effect, or parameters that do not belong to the effect.
+        Unknown preset or effect, parameters that do not belong to the effect, or a value that is
+        not acceptable.
 
     Examples
     --------
@@ -100,7 +109,7 @@ def build_rig(
         chosen = VirtualClock()
     elif clock == "realtime":
         chosen = RealClock()
-    elif isinstance(clock, str):
+    elif not hasattr(clock, "sleep"):
         raise ValueError(f"clock={clock!r} is not 'virtual', 'realtime' or a clock")
     else:
         chosen = clock

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from drivers.types import is_number
 from simulated_rig.config import Drift, DriveScatter, FlameModulation, Interference, RigConfig
 from simulated_rig.cycle import free_amplitude
 from simulated_rig.plant import Mode, Preform, SideResonator
@@ -128,6 +129,8 @@ class DistributedDelay(Effect):
     mean_delay_s: float = parameter("s", 5e-5, 8e-4)
 
     def apply(self, config: RigConfig) -> RigConfig:
+        if self.mean_delay_s == 0.0:
+            return config
         stages = 3
         pole_hz = stages / (2 * np.pi * self.mean_delay_s)
         flame = config.plant.flame
@@ -609,6 +612,24 @@ EFFECTS: dict[str, type[Effect]] = {
 }
 
 
+FAR = 100.0  # beyond barely visible and gross; farther off, a parameter is taken for a slip
+
+
+def _require_plausible(key: str, kind: type[Effect], parameters: Mapping[str, Any]) -> None:
+    for f in fields(kind):
+        told = f.metadata
+        value, high = parameters[f.name], FAR * max(told["barely"], told["gross"])
+        vanishes = told["graded"] and told["gross"] > told["barely"]
+        low = 0.0 if vanishes else min(told["barely"], told["gross"]) / FAR
+        if told["signed"]:
+            low = -high
+        if not is_number(value) or not low <= value <= high:
+            raise ValueError(
+                f"effect {key!r}: {f.name}={value!r} is not a number from {low:g} to {high:g} "
+                f"({told['unit']})"
+            )
+
+
 def make_effect(key: str, parameters: Mapping[str, float]) -> Effect:
     """The effect of that name whose parameters these are.
 
@@ -617,13 +638,17 @@ def make_effect(key: str, parameters: Mapping[str, float]) -> Effect:
     Raises
     ------
     ValueError
-        Unknown name, or no variant with exactly these parameters.
+        Unknown name, no variant with exactly these parameters, or a value far from any that an
+        experiment could show.
     """
+    if not isinstance(parameters, Mapping):
+        raise ValueError(f"effect {key!r}: parameters={parameters!r} is not a table")
     chosen = [v for v in VARIANTS if key in (v.name, f"{v.name}/{v.variant}")]
     if not chosen:
         raise ValueError(f"effect={key!r} is not one of {sorted(EFFECTS)}")
     for kind in chosen:
         if {f.name for f in fields(kind)} == set(parameters):
+            _require_plausible(key, kind, parameters)
             return kind(**parameters)
     known = "; ".join(f"{v.variant or v.name}: {[f.name for f in fields(v)]}" for v in chosen)
     raise ValueError(f"parameters={sorted(parameters)} of effect {key!r} are not one of {known}")

@@ -100,6 +100,12 @@ def test_a_generator_over_visa_and_a_board_make_a_rig(board: Board) -> None:
         ("composed", {"colour": "red"}, "unknown options colour"),
         ("composed", {"input": {"driver": "ear"}}, r"input\.driver='ear'"),
         ("soundcard", {"colour": "red"}, "unknown options"),
+        ("composed", {"limits": 3}, "limits=3 is not a table"),
+        ("composed", {"limits": {"max_amplitude_v": True}}, "max_amplitude_v=True is not a finite"),
+        ("composed", {"output": 3}, "output=3 is not a table"),
+        ("composed", {"flows": {"air": {"max_slpm": 3.0}}}, "flows: air: address is missing"),
+        ("composed", {"interlocks": 3}, "interlocks=3 is not a table"),
+        ("composed", {"input": {"driver": "scope", "colour": 1}}, "input: unknown options colour"),
     ],
 )
 def test_bad_options_name_what_is_wrong(
@@ -107,6 +113,22 @@ def test_bad_options_name_what_is_wrong(
 ) -> None:
     with pytest.raises(SettingError, match=text):
         open_device(driver, "bench", options(board, tone) | change)
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({}, "'bench': host_api is missing"),
+        ({"host_api": "ALSA", "latency_s": "0"}, "latency_s='0' is not a finite number"),
+        ({"host_api": "ALSA", "speaker": True}, "speaker=True is not a whole number"),
+        ({"host_api": "ALSA", "channels": [ROWS[0] | {"quantity": "love"}]}, "quantity='love'"),
+        ({"host_api": "ALSA", "channels": 3}, "channels=3 is not a list of tables"),
+    ],
+)
+def test_options_of_a_sound_card_name_what_is_wrong(change: dict[str, object], text: str) -> None:
+    given = {"limits": LIMITS, "input_device": "a", "output_device": "b", "channels": ROWS}
+    with pytest.raises(SettingError, match=text):
+        open_device("soundcard", "bench", given | change)
 
 
 def test_limits_are_required() -> None:

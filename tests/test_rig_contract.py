@@ -47,6 +47,17 @@ def test_unknown_names_are_refused_with_the_known_ones() -> None:
         build_rig("ghost")
     with pytest.raises(ValueError, match="flame_delay"):
         build_rig(effects={"ghost": {}})
+    for delay_s in (1e5, -1e-4, float("nan"), "long", True):
+        with pytest.raises(ValueError, match=r"delay_s=.* is not a number from 0 to 0\.1"):
+            build_rig(effects={"flame_delay": {"delay_s": delay_s}})  # type: ignore[dict-item]
+    with pytest.raises(ValueError, match=r"skew_s=0\.1 is not a number from -0\.005"):
+        build_rig(effects={"channel_mismatch/skew": {"skew_s": 0.1}})
+    with pytest.raises(ValueError, match=r"lowpass_hz=0\.0 is not a number from 20 to"):
+        build_rig(effects={"channel_mismatch/lowpass": {"lowpass_hz": 0.0}})
+    with pytest.raises(ValueError, match="seed=-1"):
+        build_rig(seed=-1)
+    with pytest.raises(ValueError, match="effects=3 is not a table"):
+        build_rig(effects=3)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="clock"):
         build_rig(clock="tomorrow")  # type: ignore[arg-type]
 

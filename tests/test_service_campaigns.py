@@ -217,8 +217,12 @@ def test_sealed_rigs_keep_their_secret_until_asked(client: httpx.Client) -> None
     assert client.get("/audit").json()[0]["action"] == "reveal"
     assert client.delete("/simulated-rigs/secret").status_code == 204
     assert client.delete("/simulated-rigs/quick").status_code == 409
-    wrong = {"name": "wrong", "effects": {"gremlins": {}}}
-    assert client.post("/simulated-rigs", json=wrong).status_code == 422
+    for effects, says in (
+        ({"gremlins": {}}, "effect='gremlins'"),
+        ({"flame_delay": {"delay_s": 1e9}}, "delay_s=1000000000.0 is not a number from 0 to 0.1"),
+    ):
+        refused = client.post("/simulated-rigs", json={"name": "wrong", "effects": effects})
+        assert (refused.status_code, says in refused.json()["detail"]) == (422, True), refused.text
 
 
 def test_a_closed_loop_is_a_job_and_repeats_nothing(server: Running, client: httpx.Client) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from daq.store import write_json
 from drivers.errors import SettingError
-from drivers.factory import open_device
+from drivers.factory import known_options, made, open_device
 from drivers.protocols import DuplexRig
 from drivers.types import OutputLimits
 
@@ -106,11 +106,11 @@ def open_simulated(entry: RigEntry) -> "SimulatedRig":
     """A simulated rig from `build_rig`'s own parameters."""
     from simulated_rig import build_rig
 
-    options = dict(entry.options)
-    limits = options.pop("limits", None)
+    where = f"rig {entry.name!r}"
+    options = dict(known_options(build_rig, where, entry.options, "name"))
+    if options.get("limits") is not None:
+        options["limits"] = made(OutputLimits, f"{where}: limits", options["limits"])
     try:
-        if limits is not None:
-            options["limits"] = OutputLimits(**limits)
         return build_rig(name=entry.name, **options)
     except (TypeError, ValueError) as error:
-        raise SettingError(f"rig {entry.name!r}: {error}") from error
+        raise SettingError(f"{where}: {error}") from error
