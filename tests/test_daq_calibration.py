@@ -210,6 +210,7 @@ def test_book_applies_the_newest_and_names_what_is_stale_or_missing(tmp_path: Pa
     book.add(Calibration("SN1", "pistonphone", 0.0022, 0.01, "V/Pa", at=new))
     book.add(Calibration("SN2", "pistonphone", 0.0019, 0.01, "V/Pa", at=old))
     book.add(Calibration("p2", "skew", 2e-5, 1e-7, "s", at=new))
+    book.add(Calibration("drive", "pistonphone", 0.1, 0.01, "V/Pa", at=new))  # a voltage has none
     channels = [
         Channel("p1", "pressure", "Pa", 0.002, serial_number="SN1"),
         Channel("p2", "pressure", "Pa", 0.002, serial_number="SN2"),

@@ -217,6 +217,7 @@ def test_a_calibration_is_in_force_from_its_upload(client: httpx.Client) -> None
     assert first["channels"][0]["volts_per_unit"] == 0.05
     assert first["channels"][0]["in_force"] == {"pistonphone": old.json()["id"]}
     assert "p1: pistonphone of 2020-01-31 is stale" in first["remarks"]
+    assert "p1: calibrated at 0.05 V/Pa, 25 times the nominal 0.002" in first["remarks"][0]
     fresh = {key: value for key, value in CALIBRATION.items() if key != "at"}
     new = client.post("/calibrations", json={**fresh, "value": 0.06}).json()
     skew = {"subject": "p2", "method": "skew", "value": 2e-6, "uncertainty": 1e-7, "unit": "s"}
@@ -232,25 +233,37 @@ def test_a_calibration_is_in_force_from_its_upload(client: httpx.Client) -> None
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "says"),
     [
-        {"value": -0.05},
-        {"uncertainty": -1},
-        {"method": "guess"},
-        {"subject": ""},
-        {"at": "2020-01-31T12:00:00"},
-        {"at": "2999-01-31T12:00:00Z"},
-        {"valid_days": 0},
-        {"data": {"x": "\ud800"}},
-        {"certificate": "x"},
+        ({"value": -0.05}, "value=-0.05 is not a pistonphone's"),
+        ({"value": 1e300}, "value=1e+300 is not a pistonphone's"),
+        ({"value": 2.0, "unit": "mV/Pa"}, "give unit 'V/Pa' and value=0.002"),
+        ({"unit": "bananas"}, "unit='bananas' is not 'V/Pa'"),
+        ({"method": "skew", "value": 1e6, "unit": "furlong"}, "unit='furlong' is not 's'"),
+        ({"method": "skew", "value": 0.01, "unit": "s"}, "value=0.01 is not a skew's -0.001 to"),
+        ({"method": "skew", "value": 2.0, "unit": "µs"}, "give unit 's' and value=2e-06"),
+        ({"uncertainty": -1}, "uncertainty"),
+        ({"uncertainty": 3}, "uncertainty=3.0 is not a number from 0 to 1"),
+        ({"method": "guess"}, "method"),
+        ({"subject": ""}, "subject"),
+        ({"subject": "p\0"}, "subject='p\\x00' is not"),
+        ({"subject": "../../x"}, "subject='../../x' is not"),
+        ({"at": "2020-01-31T12:00:00"}, "at"),
+        ({"at": "2999-01-31T12:00:00Z"}, "at"),
+        ({"valid_days": 0}, "valid_days"),
+        ({"data": {"x": "\ud800"}}, "body"),
+        ({"certificate": "x"}, "certificate"),
     ],
 )
-def test_what_is_no_calibration_is_refused(client: httpx.Client, change: dict[str, Any]) -> None:
+def test_what_is_no_calibration_is_refused(
+    client: httpx.Client, change: dict[str, Any], says: str
+) -> None:
     before = client.get("/calibrations").json()
     body = json.dumps({**CALIBRATION, **change})
     headers = {"Content-Type": "application/json"}
     answer = client.post("/calibrations", content=body, headers=headers)
     assert answer.status_code == 422, answer.text
+    assert says in answer.json()["detail"]
     assert client.get("/calibrations").json() == before
 
 

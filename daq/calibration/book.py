@@ -5,7 +5,6 @@ calibration when it moves to another input), otherwise to the channel's name.
 """
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -15,18 +14,34 @@ from typing import Any, Literal
 from daq.errors import CorruptFile
 from daq.records import check
 from daq.store import slug, utc_now, write_json
-from drivers.types import Channel
+from drivers.types import Channel, is_number
 
 FORMAT = "calibration/1"
 Method = Literal["pistonphone", "exchange", "skew", "response"]
+
+
+# The unit of each method's value, and the sizes that a measurement can have. A skew lies far below
+# a period of any oscillation: more is a slip, or another recording.
+RANGES: dict[str, tuple[str, float, float]] = {
+    "pistonphone": ("V/Pa", 1e-9, 1e3),
+    "exchange": ("1", 1e-3, 1e3),
+    "skew": ("s", -1e-3, 1e-3),
+    "response": ("Pa/V", 1e-9, 1e9),
+}
+MULTIPLES = {  # of those units, which would be taken for them
+    "V/Pa": {"mV/Pa": 1e-3, "µV/Pa": 1e-6, "uV/Pa": 1e-6, "V/kPa": 1e-3, "mV/kPa": 1e-6},
+    "s": {"ms": 1e-3, "µs": 1e-6, "us": 1e-6, "ns": 1e-9},
+    "1": {"%": 1e-2},
+    "Pa/V": {"kPa/V": 1e3, "mPa/V": 1e-3, "Pa/mV": 1e3},
+}
 
 
 @dataclass(frozen=True)
 class Calibration:
     """One result, with its relative (or for times absolute) standard uncertainty.
 
-    `subject` is a serial number or a channel's name. `value` is V/unit for a pistonphone, seconds
-    for a skew, the mean gain for an exchange or response; curves lie in `data`. `reference` names
+    `subject` is a serial number or a channel's name. `value` and `unit` are those of `RANGES`:
+    V/Pa, for an exchange or response the mean gain; curves lie in `data`. `reference` names
     what it was measured against. `valid_days`: after that it is stale.
     """
 
@@ -41,12 +56,19 @@ class Calibration:
     data: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        check(bool(self.subject), "subject", self.subject, "a serial number or a channel's name")
-        check(math.isfinite(self.value), "value", self.value, "a finite number")
-        positive = self.method != "pistonphone" or self.value > 0
-        check(positive, "value", self.value, "a sensitivity > 0")
-        uncertain = math.isfinite(self.uncertainty) and self.uncertainty >= 0
-        check(uncertain, "uncertainty", self.uncertainty, "a finite number >= 0")
+        named = self.subject.isprintable() and self.subject[:1] not in ("", " ", ".", "/")
+        asked = "a serial number or a channel's name: printable, and no path"
+        check(named, "subject", self.subject, asked)
+        check(self.method in RANGES, "method", self.method, f"one of {', '.join(RANGES)}")
+        unit, low, high = RANGES[self.method]
+        wanted = repr(unit)
+        if scale := MULTIPLES[unit].get(self.unit):
+            wanted += f"; give unit {unit!r} and value={self.value * scale:.9g}"
+        check(self.unit == unit, "unit", self.unit, wanted)
+        plausible = is_number(self.value) and low <= self.value <= high
+        check(plausible, "value", self.value, f"a {self.method}'s {low:g} to {high:g} {unit}")
+        uncertain = is_number(self.uncertainty) and 0 <= self.uncertainty <= 1
+        check(uncertain, "uncertainty", self.uncertainty, "a number from 0 to 1")
         if not self.at:
             object.__setattr__(self, "at", utc_now())
         lasting = 0 < self.valid_days <= 1e8
@@ -102,7 +124,9 @@ class CalibrationBook:
         """
         newest = {(c.subject, c.method): name for name, c in self.named().items()}
         wanted: list[list[tuple[str, Method]]] = [
-            [(channel.serial_number or channel.name, "pistonphone"), (channel.name, "skew")]
+            [(channel.name, "skew")]
+            if channel.quantity != "pressure"
+            else [(channel.serial_number or channel.name, "pistonphone"), (channel.name, "skew")]
             for channel in channels
         ]
         return [{key[1]: newest[key] for key in keys if key in newest} for keys in wanted]
@@ -122,7 +146,14 @@ class CalibrationBook:
         for channel, names in zip(channels, self.in_force(channels), strict=True):
             used = {method: named[name] for method, name in names.items()}
             if "pistonphone" in used:
-                channel = replace(channel, volts_per_unit=used["pistonphone"].value)
+                value, nominal = used["pistonphone"].value, abs(channel.volts_per_unit)
+                if not 0.1 <= value / nominal <= 10:
+                    remarks.append(
+                        f"{channel.name}: calibrated at {value:g} V/Pa, "
+                        f"{value / nominal:.3g} times the nominal {nominal:g}: see that it is "
+                        "this microphone's"
+                    )
+                channel = replace(channel, volts_per_unit=value)
             elif channel.quantity == "pressure":
                 subject = channel.serial_number or channel.name
                 remarks.append(f"{channel.name}: no calibration of {subject!r}, nominal value used")
