@@ -28,8 +28,10 @@ class Online:
 class OnlineTable(Table):
     """The same on the wire."""
 
-    relative_error: float | None = Field(default=None, gt=0)
-    wanted: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict, max_length=100)
+    relative_error: float | None = Field(default=None, ge=1e-6)
+    wanted: dict[str, Annotated[float, Field(ge=1e-6)]] = Field(
+        default_factory=dict, max_length=100
+    )
     after_runs: int = Field(default=5, ge=1, le=10_000)
     every: int = Field(default=1, ge=1, le=1000)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pydantic import Field
 
 from daq.errors import CampaignError
-from daq.tables import Table
+from daq.tables import Table, Title
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class OperatingPointTable(Table):
 
     set: dict[str, float] = Field(min_length=1, max_length=20)
     settle_s: float = Field(default=5.0, ge=0, le=3600)
-    name: str = Field(default="", max_length=100)
+    name: Title = ""
 
     def point(self) -> OperatingPoint:
         """As the campaign uses it."""

@@ -29,7 +29,7 @@ from daq.online import Online, OnlineTable
 from daq.operating import OperatingPoint, OperatingPointTable
 from daq.records import Role
 from daq.supervise import InterlockRule, Limit
-from daq.tables import Table
+from daq.tables import Table, Title
 
 Order = Literal["listed", "random"]
 MAX_RECORD_S = 60.0
@@ -150,7 +150,7 @@ class ConditionModel(Table):
     frequency_hz: float | None = Field(default=None, gt=0)
     offset: float | None = Field(default=None, gt=-0.9, lt=10)
     amplitude_v: float | None = Field(default=None, gt=0)
-    over_threshold: float | None = Field(default=None, gt=1)
+    over_threshold: float | None = Field(default=None, gt=1, le=100)
     role: Role = "fit"
 
     @model_validator(mode="after")
@@ -175,9 +175,9 @@ class GridModel(Table):
 
     frequencies_hz: list[PositiveFloat] = Field(default_factory=list)
     offsets: list[float] = Field(default_factory=list)
-    span: tuple[float, float] | None = None
+    span: Annotated[tuple[float, float], Field(strict=False)] | None = None
     count: int = Field(default=7, ge=2, le=1000)
-    over_threshold: list[Annotated[float, Field(gt=1)]] = Field(default_factory=list)
+    over_threshold: list[Annotated[float, Field(gt=1, le=100)]] = Field(default_factory=list)
     amplitudes_v: list[PositiveFloat] = Field(default_factory=list)
     repeats: int = Field(default=1, ge=1, le=100)
     validation_share: float = Field(default=0.25, ge=0, le=0.9)
@@ -230,6 +230,10 @@ class LimitModel(Table):
     def _bounded(self) -> "LimitModel":
         if self.high is None and self.low is None:
             raise ValueError("give high, low or both")
+        if self.high is not None and self.low is not None and self.high <= self.low:
+            raise ValueError(f"high={self.high:g} is not above low={self.low:g}")
+        if self.statistic == "peak" and self.high is not None and self.high <= 0:
+            raise ValueError(f"high={self.high:g} is not above zero, which no peak is below")
         return self
 
 
@@ -245,13 +249,13 @@ class PlanModel(Table):
     """A plan on the wire: TOML files and the REST body have these keys."""
 
     format: Literal["campaign-plan/1"] = "campaign-plan/1"
-    title: str = "campaign"
+    title: Title = "campaign"
     conditions: list[ConditionModel] = Field(default_factory=list, max_length=10_000)
     grid: GridModel | None = None
     free_runs: int = Field(default=1, ge=1, le=1000)
     cold: list[ConditionModel] = Field(default_factory=list, max_length=10_000)
-    record_s: float = Field(default=2.0, gt=0, le=3600)
-    precision: float | None = Field(default=None, gt=0, lt=1)
+    record_s: float = Field(default=2.0, ge=0.01, le=3600)
+    precision: float | None = Field(default=None, ge=1e-6, lt=1)
     criterion_db: float = Field(default=20.0, ge=3, le=80)
     strategy: Strategy = "predict"
     order: Order = "listed"
@@ -280,6 +284,11 @@ class PlanModel(Table):
             raise ValueError("a design chooses the conditions: leave conditions, grid and cold out")
         if self.design is not None and self.operating_points:
             raise ValueError("a design holds at one operating point: leave operating_points out")
+        names = [point.name for point in self.operating_points if point.name]
+        if double := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"operating_points: two of the name {double[0]!r}")
+        if self.low_hz >= self.high_hz:
+            raise ValueError(f"low_hz={self.low_hz:g} is not below high_hz={self.high_hz:g}")
         return self
 
     def plan(self) -> Plan:

@@ -102,16 +102,22 @@ class InterlockRule:
     wait_s: float = 600.0
 
 
+def problem(limits: Sequence[Limit], channels: Sequence[Channel]) -> str | None:
+    """What of the limits cannot be watched on a rig of these channels."""
+    names = [channel.name for channel in channels]
+    for limit in limits:
+        if limit.channel not in names:
+            return f"limits name the channel {limit.channel!r}; the rig has {', '.join(names)}"
+    return None
+
+
 class Supervisor:
     """Applies limits to blocks. Raises `CampaignError` for a limit on an unknown channel."""
 
     def __init__(self, limits: Sequence[Limit], channels: Sequence[Channel]) -> None:
+        if text := problem(limits, channels):
+            raise CampaignError(text)
         names = [channel.name for channel in channels]
-        unknown = [limit.channel for limit in limits if limit.channel not in names]
-        if unknown:
-            raise CampaignError(
-                f"limits name the channel {unknown[0]!r}; the rig has {', '.join(names)}"
-            )
         self._watched = [
             (limit, names.index(limit.channel), channels[names.index(limit.channel)].volts_per_unit)
             for limit in limits

@@ -1,9 +1,14 @@
-"""The base of every table in a plan: unknown keys and NaN are refused."""
+"""The base of every table in a plan: unknown keys, other types and NaN are refused."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+#: What people call something: one line of text.
+Title = Annotated[str, Field(max_length=200, pattern=r"^[^\x00-\x1f\x7f]*$")]
 
 
 class Table(BaseModel):
     """A table of a plan, in TOML or JSON."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)

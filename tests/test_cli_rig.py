@@ -37,6 +37,24 @@ def test_dry_run_moves_nothing_and_counts(plan: Path, capfd: pytest.CaptureFixtu
     assert "99" in err
 
 
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ('limits = [{ channel = "nope", high = 1.0 }]', "limits name the channel 'nope'; the rig"),
+        ('control_channel = "drive"', "control_channel='drive' is no pressure channel"),
+        ("online = { wanted = { bogus = 0.1 } }", "online.wanted: 'bogus' is not a parameter"),
+    ],
+)
+@pytest.mark.parametrize("command", ["dry-run", "run"])
+def test_a_plan_that_cannot_work_on_the_rig_is_refused_before_it_moves(
+    plan: Path, capfd: pytest.CaptureFixture[str], command: str, line: str, says: str
+) -> None:
+    plan.write_text(f"{line}\n{PLAN}", encoding="utf-8")
+    code, _, err = entrain(capfd, "campaign", command, plan)
+    assert (code, says in err) == (2, True), err
+    assert "no campaigns" in entrain(capfd, "campaign", "list")[1]
+
+
 def test_campaign_run_list_and_show(plan: Path, capfd: pytest.CaptureFixture[str]) -> None:
     code, out, err = entrain(capfd, "campaign", "run", plan, "--seed", "3", "--json", "-")
     assert (code, err) == (0, "")

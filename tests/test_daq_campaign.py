@@ -247,6 +247,23 @@ def test_plans_from_toml_and_json(tmp_path: Path) -> None:
         ({"conditions": [{"offset": 0.1, "frequency_hz": 170}]}, "one of them"),
         ({"conditions": [{"offset": 0.1, "amplitude_v": -1}]}, r"conditions\[0\]\.amplitude_v=-1"),
         ({"record_s": 0}, "record_s=0"),
+        ({"record_s": 1e-9}, "record_s=1e-09"),
+        ({"record_s": True}, "record_s=True"),
+        ({"record_s": "2"}, "record_s='2'"),
+        ({"hysteresis": "yes"}, "hysteresis='yes'"),
+        ({"title": "t" * 100_000}, "title="),
+        ({"title": "a\0b"}, "title="),
+        ({"precision": 1e-30}, "precision=1e-30"),
+        ({"low_hz": 500.0, "high_hz": 50.0}, "low_hz=500 is not below high_hz=50"),
+        ({"conditions": [{"offset": 0.1, "over_threshold": 1e9}]}, r"over_threshold=1000000000\.0"),
+        ({"limits": [{"channel": "p1", "high": -1.0, "low": 5.0}]}, "high=-1 is not above low=5"),
+        ({"limits": [{"channel": "p1", "high": 0.0}]}, "high=0 is not above zero"),
+        (
+            {"declared_model": {"flame": "dragon"}},
+            r"declared_model\.flame='dragon': Input should be",
+        ),
+        ({"declared_model": {"nonlinearity": "x"}}, r"declared_model\.nonlinearity='x'"),
+        ({"operating_points": 2 * [{"set": {"flow": 1.0}, "name": "a"}]}, "two of the name 'a'"),
     ]:
         with pytest.raises(InputError, match=message):
             parse_plan(bad)

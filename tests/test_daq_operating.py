@@ -153,7 +153,7 @@ def test_impossible_points_are_named(store: RunStore) -> None:
         ):
             run_campaign(rig, plan, store)
         ranges = rig.operating_ranges()
-        report = dry_run(plan, rig.limits, rig.sample_rate_hz, None, ranges)
+        report = dry_run(plan, rig.limits, rig.sample_rate_hz, list(rig.channels), None, ranges)
         with pytest.raises(SettingError, match="flow=9"):
             rig.operate({"flow": 9.0})
     assert report["problems"] == [

@@ -1,8 +1,10 @@
 """Models declared in TOML: what they become, what is refused, and that they are what is fitted."""
 
+import itertools
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from typer.testing import CliRunner
 
 from daq.cli import app
 from daq.importers import open_campaign
+from daq.importers.folder import Flame, Nonlinearity
 from identify.chances import beta_tail, chi2_points, chi2_tail, f_tail, rank_correlation
 from identify.declare import ModelError, described, read_model, structure_of
 from identify.descent import levenberg_marquardt
@@ -86,6 +89,14 @@ def test_what_is_wrong_is_named_with_the_file(text: str, words: list[str], tmp_p
 def test_what_a_campaign_declares_wrongly_is_named(model: DeclaredModel, words: str) -> None:
     with pytest.raises(ModelError, match=words):
         declared_structure(model)
+
+
+def test_every_word_that_a_campaign_may_declare_is_a_model() -> None:
+    words = [get_args(Flame), get_args(Nonlinearity)]
+    for flame, nonlinearity in itertools.product(*words):
+        structure = declared_structure(DeclaredModel(flame=flame, nonlinearity=nonlinearity))
+        assert described(structure).flame == flame
+        assert structure.nonlinearity == nonlinearity
 
 
 def test_a_flame_without_a_pole_has_none_that_drifts() -> None:

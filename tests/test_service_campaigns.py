@@ -122,6 +122,29 @@ def test_dry_run_names_what_cannot_be_done(client: httpx.Client) -> None:
 
 
 @pytest.mark.parametrize(
+    ("plan", "says"),
+    [
+        ({"limits": [{"channel": "no", "high": 1}]}, "limits name the channel 'no'"),
+        (
+            {"conditions": [{"frequency_hz": 170, "amplitude_v": 1e6}]},
+            "condition 1: amplitude_v=1e+06 is above the limit",
+        ),
+    ],
+)
+def test_what_a_dry_run_finds_is_not_started(
+    client: httpx.Client, plan: dict[str, Any], says: str
+) -> None:
+    body = {"rig": "quick", "plan": plan}
+    (problem,) = client.post("/campaigns/dry-run", json=body).json()["problems"]
+    assert says in problem
+    before = client.get("/jobs").json()["items"]
+    for path in ("/campaigns", "/close-loops"):
+        refused = client.post(path, json=body)
+        assert (refused.status_code, refused.json()["detail"]) == (422, problem)
+    assert client.get("/jobs").json()["items"] == before
+
+
+@pytest.mark.parametrize(
     ("body", "status", "says"),
     [
         ({"rig": "none"}, 404, "'none'"),

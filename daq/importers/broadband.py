@@ -28,14 +28,15 @@ import numpy.typing as npt
 from pydantic import Field, ValidationError
 
 from daq.errors import InputError
-from daq.importers.folder import ChannelTable, Strict, explain, inside, read_columns, read_toml
+from daq.importers.folder import ChannelTable, explain, inside, read_columns, read_toml
+from daq.tables import Table
 from drivers.errors import SettingError
 
 Stretch = Annotated[list[int], Field(min_length=2, max_length=2)]
 Feedback = Literal["linear", "cubic", "cubic_quadratic"]
 
 
-class ExcitationTable(Strict):
+class ExcitationTable(Table):
     """The recording and its stretches, in samples."""
 
     kind: Literal["broadband"]
@@ -47,13 +48,13 @@ class ExcitationTable(Strict):
     period_starts: list[int] = Field(default=[])
 
 
-class OscillatorTable(Strict):
+class OscillatorTable(Table):
     """The feedback that the experimenter believes."""
 
     feedback: Feedback = "linear"
 
 
-class BroadbandToml(Strict):
+class BroadbandToml(Table):
     """The whole of `campaign.toml`."""
 
     format: Literal["campaign-folder/1"]

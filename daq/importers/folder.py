@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from daq.errors import InputError
 from daq.importers.checks import SampleCheck, require_forcing
@@ -20,6 +20,7 @@ from daq.importers.recording import Recording, read_recording, require_picked
 from daq.importers.whole import all_or_nothing, alone
 from daq.records import CampaignCard, Kind, Role, RunHeader, RunSummary
 from daq.store import RunStore, slug, utc_now
+from daq.tables import Table, Title
 from drivers.errors import SettingError
 from drivers.types import Channel, Quantity, require_si
 
@@ -28,29 +29,35 @@ SLICE_FRAMES = 1 << 18
 _MAX_TOML_BYTES = 4 << 20
 
 
-class Strict(BaseModel):
-    """Unknown keys, other types and NaN are refused."""
+# What `identify` takes for a flame and, without nodes, for a nonlinearity; a test keeps them alike.
+Flame = Literal[
+    "none",
+    "none_with_delay",
+    "first_order_lowpass",
+    "first_order_lowpass_with_delay",
+    "second_order_lowpass",
+    "second_order_lowpass_with_delay",
+]
+Nonlinearity = Literal["polynomial", "saturation", "linear"]
 
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
-
-class MediumTable(Strict):
+class MediumTable(Table):
     """The gas in the tube."""
 
-    density_kg_m3: float = Field(default=1.2, gt=0)
-    sound_speed_m_s: float = Field(default=343.0, gt=0)
+    density_kg_m3: float = Field(default=1.2, gt=0, le=1e4)
+    sound_speed_m_s: float = Field(default=343.0, gt=0, le=1e4)
 
 
-class DeclaredModelTable(Strict):
+class DeclaredModelTable(Table):
     """The model that the experimenter believes."""
 
     modes: int = Field(default=2, ge=1, le=20)
-    flame: str = "first_order_lowpass"
-    nonlinearity: str = "polynomial"
+    flame: Flame = "first_order_lowpass"
+    nonlinearity: Nonlinearity = "polynomial"
     nonlinearity_degree: int = Field(default=3, ge=1, le=15)
 
 
-class ChannelTable(Strict):
+class ChannelTable(Table):
     """One column of every recording; `variable` names it in files whose columns have names."""
 
     name: str = Field(min_length=1, pattern=r"^[^/\x00]+$")
@@ -78,7 +85,7 @@ class ChannelTable(Strict):
         )
 
 
-class RunTable(Strict):
+class RunTable(Table):
     """One recording."""
 
     file: str = Field(min_length=1)
@@ -89,11 +96,11 @@ class RunTable(Strict):
     role: Role = "fit"
 
 
-class CampaignToml(Strict):
+class CampaignToml(Table):
     """The whole of `campaign.toml`."""
 
     format: Literal["campaign-folder/1"]
-    title: str
+    title: Title
     sample_rate_hz: float = Field(gt=0)
     medium: MediumTable = MediumTable()
     declared_model: DeclaredModelTable = DeclaredModelTable()

@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from daq import supervise
 from daq.campaign import IGNITION_S, expand
 from daq.errors import InputError
 from daq.operating import OperatingPoint, problem
 from daq.plan import Condition, Plan, integer_bin
-from drivers.types import OutputLimits
+from drivers.types import Channel, OutputLimits
 
 FREE_S = 3.0  # two looks of one second and the silence before them
 APPROACH_S = 6.0  # a probe, a drive, a check and the settling, on the thesis's rig
@@ -39,11 +40,13 @@ def dry_run(
     plan: Plan,
     limits: OutputLimits,
     sample_rate_hz: float,
+    channels: Sequence[Channel],
     free_hz: float | None = None,
     operating: Mapping[str, tuple[float, float]] | None = None,
     expected: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
-    """The conditions in order, what is wrong with each, and the rig time in seconds.
+    """The conditions in order, what is wrong with the plan and each of them, and the rig time in
+    seconds.
 
     `operating`: what the rig can set of its operating point; `expected`: the precision of each
     parameter that the plan is expected to leave (`daq.service.designing`).
@@ -57,7 +60,8 @@ def dry_run(
         for item in expand(plan)
     ]
     settling = sum(point.settle_s for point in plan.operating_points)
-    problems = [f"condition {item.index}: {item.problem}" for item in items if item.problem]
+    problems = [text for text in (_unwatched(plan, channels),) if text]
+    problems += [f"condition {item.index}: {item.problem}" for item in items if item.problem]
     return {
         "title": plan.title,
         "conditions": [asdict(item) for item in items],
@@ -69,6 +73,16 @@ def dry_run(
         "problems": problems,
         "expected_precision": [dict(row) for row in expected],
     }
+
+
+def _unwatched(plan: Plan, channels: Sequence[Channel]) -> str | None:
+    pressures = [channel.name for channel in channels if channel.quantity == "pressure"]
+    if plan.control_channel is not None and plan.control_channel not in pressures:
+        return (
+            f"control_channel={plan.control_channel!r} is no pressure channel of the rig; it has "
+            f"{', '.join(pressures) or 'none'}"
+        )
+    return supervise.problem(plan.limits, channels)
 
 
 def _at_point(

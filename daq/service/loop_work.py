@@ -69,7 +69,8 @@ class RigSteps:
         return read_summary(self._store.run_path(run), run.partition("/")[0])
 
     def expected_seconds(self, plan: Plan) -> float:
-        report = dry_run(plan, self._rig.limits, self._rig.sample_rate_hz)
+        rig = self._rig
+        report = dry_run(plan, rig.limits, rig.sample_rate_hz, list(rig.channels))
         return float(report["rig_seconds"])
 
     def record(self, campaign: str, plan: Plan) -> Recorded:

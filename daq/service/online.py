@@ -16,16 +16,29 @@ from daq.plan import Plan
 from daq.schedule import Outcome
 from identify.assess import lack_of_fit_p
 from identify.fit import Fit, fit_orbits
-from identify.identification import Prepared, fit_structure, prepare
+from identify.identification import Prepared, declared_structure, fit_structure, prepare
 from identify.load import load_campaign
+from identify.record import DeclaredModel
 
 LEAST_P = 0.01
 WORSE = 2.0  # times the χ² a degree of freedom of the last fit: started anew
 
 
 def reviewer(plan: Plan) -> Reviewer | None:
-    """What `run_campaign` shall ask after each run; None where the plan does not ask for it."""
-    return None if plan.online is None else OnlineFit(plan.online)
+    """What `run_campaign` shall ask after each run; None where the plan does not ask for it.
+
+    Raises `InputError` where a wanted parameter is none of the model's.
+    """
+    if plan.online is None:
+        return None
+    names = declared_structure(DeclaredModel(**plan.declared_model)).parameters.names
+    for name in plan.online.wanted:
+        if name not in names:
+            raise InputError(
+                f"online.wanted: {name!r} is not a parameter of the declared model: "
+                f"{', '.join(names)}"
+            )
+    return OnlineFit(plan.online)
 
 
 class OnlineFit:
@@ -37,10 +50,7 @@ class OnlineFit:
         self._looks = 0
 
     def __call__(self, folder: Path, outcome: Outcome) -> Review | None:
-        """Fit what is recorded; None before there is enough to fit, and between looks.
-
-        Raises `InputError` where a wanted parameter is none of the model's.
-        """
+        """Fit what is recorded; None before there is enough to fit, and between looks."""
         if outcome.kind != "forced":
             return None
         campaign = load_campaign(folder)
@@ -85,12 +95,6 @@ class OnlineFit:
         return Review(data, fit.converged and bool(limits) and not missing and p > LEAST_P)
 
     def _limits(self, relative: dict[str, float]) -> dict[str, float]:
-        unknown = [name for name in self._wanted.wanted if name not in relative]
-        if unknown:
-            raise InputError(
-                f"online.wanted: {unknown[0]!r} is not a parameter of the declared model: "
-                f"{', '.join(relative)}"
-            )
         most = self._wanted.relative_error
         every = {} if most is None else dict.fromkeys(relative, most)
         return {**every, **self._wanted.wanted}

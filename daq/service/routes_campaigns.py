@@ -7,10 +7,10 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.concurrency import run_in_threadpool
 
-from daq.plan import PlanModel, parse_plan
+from daq.plan import Plan, PlanModel, parse_plan
 from daq.service.campaign_names import new_name
 from daq.service.control import lane
-from daq.service.dry_run import dry_run
+from daq.service.dry_run import dry_run, require_possible
 from daq.service.jobs import Job
 from daq.service.plan_facts import planned
 from daq.service.problems import Problem
@@ -44,6 +44,7 @@ def queue(
     """Queue a campaign on its rig; its id is fixed here, so that it can be named at once."""
     if resume is None:
         parsed = parse_plan(plan)
+        require_runnable(service, entry.name, parsed)
         campaign, title = new_name(parsed.title), parsed.title
     else:
         campaign, title = resume, f"resume {resume}"
@@ -85,13 +86,27 @@ def rehearse(body: CampaignRequest, service: Parts, who: Reader) -> DryRun:
     plan = parse_plan(body.plan)
     expected: list[dict[str, Any]] = []
     rig = service.facts(body.rig)
-    if plan.design is not None or plan.continues is not None:
+    if plan.design is not None or plan.continues is not None or plan.online is not None:
         store = str(service.settings.store_dir)
         plan, expected = service.planner.ask(planned, body.plan, store)
     report = dry_run(
-        plan, rig.limits, rig.sample_rate_hz, body.free_frequency_hz, rig.operating, expected
+        plan,
+        rig.limits,
+        rig.sample_rate_hz,
+        rig.channels,
+        body.free_frequency_hz,
+        rig.operating,
+        expected,
     )
     return DryRun(**report)
+
+
+def require_runnable(service: Service, rig: str, plan: Plan) -> None:
+    """Refuse with 422 a plan whose dry run finds problems, before it is queued."""
+    known = service.facts(rig)
+    require_possible(
+        dry_run(plan, known.limits, known.sample_rate_hz, known.channels, operating=known.operating)
+    )
 
 
 @router.post("/campaigns", status_code=202)

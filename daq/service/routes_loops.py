@@ -16,7 +16,7 @@ from daq.service.jobs import Job
 from daq.service.problems import Problem, not_found
 from daq.service.rigs import RigEntry
 from daq.service.routes_analyses import html_report, report_path
-from daq.service.routes_campaigns import ready_rig
+from daq.service.routes_campaigns import ready_rig, require_runnable
 from daq.service.routes_jobs import find, shown
 from daq.service.routes_rigs import ControlToken
 from daq.service.routes_store import Id
@@ -67,6 +67,7 @@ def start(
     spent. The job's result is the account of all rounds, `close-loop/1`."""
     first = parse_plan(body.plan)
     entry = ready_rig(service, body.rig, token)
+    require_runnable(service, body.rig, first)
     name = new_name(first.title)
     job = queue(service, entry, name, first.title, body, who.name, body.plan)
     service.audit.record(who.name, "close loop", body.rig, job=job.id, campaign=name)

@@ -117,16 +117,19 @@ def rehearse(
 ) -> None:
     """Show what a campaign would do, its limits, rig time and precision; moves nothing."""
     from daq.service.dry_run import dry_run, require_possible
+    from daq.service.rig_work import reviewer_of
     from daq.service.rigs import open_rig
     from drivers.protocols import operating_ranges
 
     wanted = ready(read(plan), store)
+    reviewer_of(wanted)  # refuses a precision of what is no parameter
     expected = precision(wanted, store)
     with open_rig(choose_rig(rig)) as device:
         report = dry_run(
             wanted,
             device.limits,
             device.sample_rate_hz,
+            list(device.channels),
             free_hz,
             operating_ranges(device),
             expected,
@@ -247,9 +250,11 @@ def _campaign(
 ) -> None:
     from daq.campaign import run_campaign
     from daq.service.commands.keyboard import HELP, Keyboard, single_keys
+    from daq.service.dry_run import dry_run, require_possible
     from daq.service.laid import noted, over
     from daq.service.rig_work import reviewer_of, summary
     from daq.service.rigs import open_rig
+    from drivers.protocols import operating_ranges
 
     stop: list[int] = []
     quiet = str(json_) == "-"
@@ -260,6 +265,10 @@ def _campaign(
         single_keys() as typed,
         CampaignView(plan, quiet) as view,
     ):
+        if campaign is None:
+            limits, rate, channels = device.limits, device.sample_rate_hz, list(device.channels)
+            ranges = operating_ranges(device)
+            require_possible(dry_run(plan, limits, rate, channels, operating=ranges))
         if typed is not None and not quiet:
             out.print(HELP, markup=False)
         result = run_campaign(
