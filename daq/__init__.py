@@ -8,5 +8,5 @@ campaigns       `plan`, `tables`, `designed`, `operating`, `online`, `schedule`,
 run store       `store`, `store_file`, `store_writer`, `store_catalogue`, `store_upkeep`, `records`,
                 `importers`, `exporters`, `locks`
 outside         `service` (REST, live streams, page), `cli`, `client`
-                (`errors`: what can go wrong in all of these)
+                (`documents`: files that people write; `errors`: what can go wrong in all of these)
 """

@@ -6,10 +6,8 @@ nearest one with a whole number of periods in the record (an integer bin: the th
 that no line leaks.
 """
 
-import json
 import math
 import random
-import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +20,7 @@ from pydantic import (
 )
 
 from daq.designed import Design, DesignTable
+from daq.documents import read_document
 from daq.entrain import Strategy
 from daq.errors import InputError
 from daq.importers.folder import DeclaredModelTable, MediumTable, explain
@@ -328,17 +327,10 @@ def read_plan(path: Path) -> Plan:
 
     Raises `InputError`.
     """
-    try:
-        text = path.read_text("utf-8")
-        content = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file") from error
-    except (ValueError, OSError) as error:
-        raise InputError(f"{path}: not readable as TOML or JSON ({error})") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds no table")
+    content = read_document(path)
     if content.get("format") == "diagnosis/1":
-        content = (content.get("next_experiment") or {}).get("plan")
-        if not isinstance(content, dict):
+        proposed = (content.get("next_experiment") or {}).get("plan")
+        if not isinstance(proposed, dict):
             raise InputError(f"{path}: this diagnosis proposes no next experiment")
+        content = proposed
     return parse_plan(content, str(path))

@@ -4,7 +4,6 @@ Plain frozen dataclasses; `daq.run_file` turns headers into HDF5 attributes and 
 keeps cards as `campaign.json`.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -56,7 +55,7 @@ class RunHeader:
         check(self.kind in get_args(Kind), "kind", self.kind, "free, forced or cold")
         check(self.role in get_args(Role), "role", self.role, "fit or validation")
         rate = self.sample_rate_hz
-        check(math.isfinite(rate) and rate > 0, "sample_rate_hz", rate, "a finite rate > 0")
+        check(0 < rate <= 1e9, "sample_rate_hz", rate, "a rate > 0, at most 1e9 Hz")
         check(len(self.channels) > 0, "channels", self.channels, "a list of one or more channels")
         if not self.volts_per_count:
             object.__setattr__(self, "volts_per_count", (1.0,) * len(self.channels))

@@ -26,6 +26,9 @@ NOT_SI: dict[str, dict[str, float]] = {
 }
 
 
+FARTHEST_M = 1000.0  # of a microphone from the tube's end; more is a slip
+
+
 def require(condition: bool, parameter: str, value: object, requirement: str) -> None:
     """Raise `SettingError` naming parameter, value and requirement unless `condition` holds."""
     if not condition:
@@ -54,7 +57,17 @@ class Channel:
     serial_number: str | None = None
 
     def __post_init__(self) -> None:
-        require(bool(self.name), "name", self.name, "a non-empty string")
+        named = (
+            self.name.isprintable() and "/" not in self.name and self.name not in ("", ".", "..")
+        )
+        require(named, "channel name", self.name, "printable text without '/', nor . or ..")
+        placed = self.position_m is None or bool(abs(self.position_m) <= FARTHEST_M)
+        require(
+            placed,
+            f"channel {self.name!r}: position_m",
+            self.position_m,
+            f"a place within {FARTHEST_M:g} m of the closed end",
+        )
         require(
             bool(np.isfinite(self.volts_per_unit)) and self.volts_per_unit != 0,
             f"channel {self.name!r}: volts_per_unit",

@@ -234,6 +234,35 @@ BAD = {
         _edit(r"\[\[channels\]\]", '[excitation]\nkind = "broadband"\n[[channels]]'),
         r"only `entrain diagnose` takes a folder with \[excitation\]",
     ),
+    "a link to itself": (
+        lambda f: (
+            (f / "runs/f166.wav").unlink(),
+            (f / "runs/f166.wav").symlink_to(f / "runs/f166.wav"),
+        ),
+        r"run file 'runs/f166\.wav': Symlink loop",
+    ),
+    "a folder": (_edit(r"runs/f166\.wav", "runs"), r"runs: is a folder: give a file"),
+    "deep": (_edit("title", f"a = {5000 * '['}\ntitle"), "not TOML: nested too deeply"),
+    "utf-16": (
+        lambda f: (f / "campaign.toml").write_bytes(
+            (f / "campaign.toml").read_text("utf-8").encode("utf-16")
+        ),
+        "save it as UTF-8",
+    ),
+    "a dot": (_edit('"p1"', '"."'), r"channel name='\.' is not printable text"),
+    "far away": (_edit("0.66", "-1e9"), "channel 'p1': position_m=-1000000000.0 is not a place"),
+    "one place": (_edit("0.66", "0.71"), r"p1, p2 are all at position_m=0\.71"),
+    "a drive of 1e300 V": (
+        _edit(r"amplitude_v = 1\.5", "amplitude_v = 1e300"),
+        "amplitude_v=1e.300",
+    ),
+    "before the world": (_edit("started_s = 60", "started_s = -1e30"), r"started_s=-1e.30"),
+    "a long title": (_edit('title = "', f'title = "{300 * "x"}'), "at most 200 characters"),
+    "a fast converter": (_edit("2000.0", "1e300"), "sample_rate_hz=1e.300"),
+    "a dragon": (
+        _edit("title", 'declared_model = {flame = "dragon"}\ntitle'),
+        r"declared_model\.flame='dragon': Input should be 'none'",
+    ),
     "twice p1": (_edit('"p2"', '"p1"'), "named twice: p1"),
     "unknown kind": (_edit('"free"', '"warm"'), r"runs\[0\]\.kind='warm'"),
     "unknown suffix": (
@@ -258,6 +287,13 @@ def test_unusable_folders_are_refused_and_leave_nothing(
     assert store.campaigns() == []
     assert store.runs() == []
     assert list(store.campaigns_dir.iterdir()) == []
+
+
+def test_a_byte_order_mark_is_read_over(tmp_path: Path, store: RunStore) -> None:
+    folder = write_folder(tmp_path / "small")
+    path = folder / "campaign.toml"
+    path.write_text(path.read_text("utf-8"), "utf-8-sig")
+    assert import_folder(folder, store).status == "complete"
 
 
 def test_link_out_of_the_folder_is_refused(tmp_path: Path, store: RunStore) -> None:

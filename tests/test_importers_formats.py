@@ -176,6 +176,7 @@ def test_columns_asked_for_are_those_delivered(tmp_path: Path) -> None:
         (RecordingOptions(PAIR, kind="cold", frequency_hz=50.0, amplitude_v=-1.0), "amplitude_v"),
         (RecordingOptions(PAIR, frequency_hz=50.0), "frequency_hz=50.0 is not for a free run"),
         (RecordingOptions(PAIR, sample_rate_hz=0.0), "sample_rate_hz=0"),
+        (RecordingOptions(PAIR, kind="cold", frequency_hz=50.0, amplitude_v=1e300), "to 10000 V"),
         (RecordingOptions(PAIR[:1]), "2 columns for 1"),
         (RecordingOptions(PAIR), "constant"),  # the second file: found while it is written
     ],

@@ -18,7 +18,6 @@ other the response) such a `campaign.toml` holds
 and no `[[runs]]`.
 """
 
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -27,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError
 
+from daq.documents import read_document
 from daq.errors import InputError
 from daq.importers.folder import ChannelTable, explain, inside, read_columns, read_toml
 from daq.tables import Table
@@ -59,7 +59,7 @@ class BroadbandToml(Table):
 
     format: Literal["campaign-folder/1"]
     title: str
-    sample_rate_hz: float = Field(gt=0)
+    sample_rate_hz: float = Field(gt=0, le=1e9)
     declared_model: OscillatorTable = OscillatorTable()
     channels: list[ChannelTable] = Field(min_length=2, max_length=2)
     excitation: ExcitationTable
@@ -85,11 +85,9 @@ class BroadbandRecord:
 def is_broadband(path: str | Path) -> bool:
     """Whether `path` is a campaign folder with an `[excitation]`."""
     description = Path(path).expanduser() / "campaign.toml"
-    if not description.is_file():
-        return False
     try:
-        return "excitation" in tomllib.loads(description.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+        return "excitation" in read_document(description)
+    except InputError:
         return False  # whoever reads it as an ordinary folder says what is wrong
 
 

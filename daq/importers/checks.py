@@ -17,6 +17,8 @@ from daq.errors import InputError
 from daq.records import Kind
 from drivers.types import Channel
 
+MOST_V = 1e4  # of a drive; more is a slip
+
 
 def require_forcing(
     where: str,
@@ -36,8 +38,18 @@ def require_forcing(
             f"{where}: frequency_hz={frequency_hz} is not below half the sample rate, "
             f"{sample_rate_hz / 2:g} Hz"
         )
-    if amplitude_v is not None and not (math.isfinite(amplitude_v) and amplitude_v >= 0):
-        raise InputError(f"{where}: amplitude_v={amplitude_v} is not a finite amplitude >= 0")
+    if amplitude_v is not None and not 0 <= amplitude_v <= MOST_V:
+        raise InputError(f"{where}: amplitude_v={amplitude_v} is not from 0 to {MOST_V:g} V")
+
+
+def require_apart(where: str, channels: Sequence[Channel]) -> None:
+    """Microphones stand at more than one place, where places are told; raises `InputError`."""
+    placed = [c for c in channels if c.quantity == "pressure" and c.position_m is not None]
+    if len(placed) > 1 and len({c.position_m for c in placed}) == 1:
+        raise InputError(
+            f"{where}: {', '.join(c.name for c in placed)} are all at "
+            f"position_m={placed[0].position_m:g}: the velocity needs two places; give each its own"
+        )
 
 
 @dataclass

@@ -7,15 +7,15 @@ imported again is found, and a changed one becomes another campaign.
 
 import hashlib
 import shutil
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
+from daq.documents import read_document, require_file
 from daq.errors import InputError
-from daq.importers.checks import SampleCheck, require_forcing
+from daq.importers.checks import SampleCheck, require_apart, require_forcing
 from daq.importers.recording import Recording, read_recording, require_picked
 from daq.importers.whole import all_or_nothing, alone
 from daq.records import CampaignCard, Kind, Role, RunHeader, RunSummary
@@ -26,7 +26,6 @@ from drivers.types import Channel, Quantity, require_si
 
 FORMAT = "campaign-folder/1"
 SLICE_FRAMES = 1 << 18
-_MAX_TOML_BYTES = 4 << 20
 
 
 # What `identify` takes for a flame and, without nodes, for a nonlinearity; a test keeps them alike.
@@ -92,7 +91,7 @@ class RunTable(Table):
     kind: Kind
     frequency_hz: float | None = Field(default=None, gt=0)
     amplitude_v: float | None = Field(default=None, ge=0)
-    started_s: float = 0.0
+    started_s: float = Field(default=0.0, ge=-1e9, le=1e9)
     role: Role = "fit"
 
 
@@ -101,7 +100,7 @@ class CampaignToml(Table):
 
     format: Literal["campaign-folder/1"]
     title: Title
-    sample_rate_hz: float = Field(gt=0)
+    sample_rate_hz: float = Field(gt=0, le=1e9)
     medium: MediumTable = MediumTable()
     declared_model: DeclaredModelTable = DeclaredModelTable()
     channels: list[ChannelTable] = Field(min_length=1, max_length=256)
@@ -135,14 +134,7 @@ def import_folder(folder: Path, store: RunStore) -> CampaignCard:
 
 def read_toml(path: Path) -> dict[str, Any]:
     """The tables of a `campaign.toml` of our format; raises `InputError`."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a campaign folder holds a campaign.toml")
-    if path.stat().st_size > _MAX_TOML_BYTES:
-        raise InputError(f"{path}: larger than {_MAX_TOML_BYTES >> 20} MiB is no description")
-    try:
-        content = tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not TOML: {error}") from error
+    content = read_document(path, "; a campaign folder holds a campaign.toml")
     if content.get("format") != FORMAT:
         raise InputError(f"{path}: format={content.get('format')!r} is not {FORMAT!r}")
     return content
@@ -189,6 +181,7 @@ def _require_consistent(path: Path, description: CampaignToml) -> None:
             channel.channel()
         except SettingError as error:
             raise InputError(f"{path}: {error}") from error
+    require_apart(str(path), [channel.channel() for channel in description.channels])
     stems = [Path(run.file).stem for run in description.runs]
     forced = 0
     for index, run in enumerate(description.runs):
@@ -300,11 +293,13 @@ def encoding(recording: Recording, full_scales_v: list[float]) -> dict[str, Any]
 
 def inside(folder: Path, name: str) -> Path:
     """The file of a run; refused when it lies outside the folder, by any path or link."""
-    path = (folder / name).resolve()
+    try:
+        path = (folder / name).resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # a link to itself, a NUL
+        raise InputError(f"{folder}: run file {name!r}: {error}") from error
     if not path.is_relative_to(folder.resolve()):
         raise InputError(f"{folder}: run file {name!r} lies outside the campaign folder")
-    if not path.is_file():
-        raise InputError(f"{folder}: run file {name!r}: no such file")
+    require_file(path, "; a run names its recording")
     return path
 
 

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from daq.documents import require_file
 from daq.errors import InputError
 
 MAX_BYTES = 2 * 2**30  # largest recording that a format without streaming may unpack to
@@ -80,8 +81,7 @@ def read_recording(path: Path, wanted: Sequence[str] = ()) -> Recording:
         )
     module, function = READERS[path.suffix.lower()]
     try:
-        if not path.is_file():
-            raise InputError(f"{path}: no such file")
+        require_file(path)
         reader: Reader = getattr(import_module(f"daq.importers.{module}"), function)
         recording = reader(path, wanted)
     except OSError as error:

@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from daq.errors import InputError
-from daq.importers.checks import require_forcing
+from daq.importers.checks import require_apart, require_forcing
 from daq.importers.folder import encoding, require_match, write_recording
 from daq.importers.recording import Recording, read_recording, require_picked
 from daq.importers.whole import all_or_nothing, alone
 from daq.records import CampaignCard, Kind, RunHeader
 from daq.store import RunStore, slug, utc_now
+from daq.tables import MAX_TITLE
 from drivers.types import Channel
 
 
@@ -47,6 +48,9 @@ def import_recordings(
     """
     if not files:
         raise InputError("files=[] is not a list of one or more recordings")
+    if len(title) > MAX_TITLE or not all(c.isprintable() for c in title):
+        raise InputError(f"title={title[:40]!r} is not one line of at most {MAX_TITLE} characters")
+    require_apart("channels", options.channels)
     read = [(path, select(path, options)) for path in files]
     headers = [
         _header(index, path, recording, options) for index, (path, recording) in enumerate(read)

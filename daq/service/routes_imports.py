@@ -12,6 +12,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from starlette.concurrency import run_in_threadpool
 
+from daq.importers.checks import MOST_V
 from daq.service.keys import Principal
 from daq.service.problems import Problem
 from daq.service.routes_jobs import shown
@@ -98,10 +99,10 @@ async def import_recording(
         ),
     ],
     column: Annotated[list[str] | None, Query(max_length=64)] = None,
-    rate_hz: Annotated[float | None, Query(gt=0)] = None,
+    rate_hz: Annotated[float | None, Query(gt=0, le=1e9)] = None,
     kind: str = "free",
-    frequency_hz: Annotated[float | None, Query(gt=0)] = None,
-    amplitude_v: Annotated[float | None, Query(ge=0)] = None,
+    frequency_hz: Annotated[float | None, Query(gt=0, le=1e9)] = None,
+    amplitude_v: Annotated[float | None, Query(ge=0, le=MOST_V)] = None,
     title: Annotated[str, Query(max_length=200)] = "",
 ) -> JobSummary:
     """Import one recording described by options (WAV, CSV, NPZ, MAT, HDF5, TDMS)."""
@@ -129,7 +130,7 @@ async def characterise(
     who: Controller,
     name: FileName,
     column: Annotated[list[str] | None, Query(max_length=64)] = None,
-    rate_hz: Annotated[float | None, Query(gt=0)] = None,
+    rate_hz: Annotated[float | None, Query(gt=0, le=1e9)] = None,
     signal: Annotated[str | None, Query(max_length=100)] = None,
 ) -> JobSummary:
     """Characterise an unforced recording; the job's result holds `characterisation/1`."""

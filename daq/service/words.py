@@ -7,6 +7,7 @@ from typing import get_args
 
 import numpy as np
 
+from daq.documents import require_file
 from daq.errors import InputError
 from daq.importers import RecordingOptions, read_recording
 from daq.importers.text import read_table
@@ -42,8 +43,7 @@ def recording_options(
 
 def read_unforced(path: Path, names: Sequence[str], rate_hz: float | None) -> Recording:
     """A recording of any format as `identify.characterise` takes it; raises `InputError`."""
-    if not path.is_file():
-        raise InputError(f"{path}: no such file")
+    require_file(path)
     if path.suffix.lower() in TEXT:
         try:
             with warnings.catch_warnings():
@@ -56,6 +56,10 @@ def read_unforced(path: Path, names: Sequence[str], rate_hz: float | None) -> Re
     rate = found.sample_rate_hz or rate_hz
     if rate is None:
         raise InputError(f"{path}: the file has no sample rate: give one")
+    if rate_hz is not None and abs(rate_hz / rate - 1) > 1e-3:
+        raise InputError(
+            f"{path}: rate_hz={rate_hz:g} is not the file's own, {rate:g}: leave it out"
+        )
     count = found.samples.shape[1]
     labels = tuple(names) or found.names or tuple(f"channel{i + 1}" for i in range(count))
     if len(labels) != count:
