@@ -303,8 +303,7 @@ class Runner:
         if self.plan.hysteresis:
             release = find_release(self.acquisition, self.columns, state)
             self.quiet()
-        reason = run.exit_reason or _limited(state)
-        return _outcome(item, state, status, reason, run.name, release)
+        return _outcome(item, state, status, run.exit_reason, run.name, release)
 
     def cold_run(self, item: Item, task: Task) -> Outcome:
         """Flame off, drive on: the acoustics and the speaker alone."""
@@ -541,19 +540,6 @@ def _seen(state: State) -> dict[str, Any]:
         "threshold_v": state.threshold_v,
         "threshold_sigma_v": state.threshold_sigma_v,
     }
-
-
-def _limited(state: State) -> str:
-    """That the drive was not as far over the threshold as asked, where the limit kept it."""
-    threshold, limit, task = state.threshold_v, state.settings.limit_v, state.task
-    if threshold is None or task.amplitude_v is not None:
-        return ""
-    if 1.1 * limit >= task.over_threshold * threshold:
-        return ""
-    return (
-        f"the limit of {limit:g} V is {limit / threshold:.1f} times the threshold, "
-        f"not {task.over_threshold:g}"
-    )
 
 
 def _outcome(
