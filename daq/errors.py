@@ -11,6 +11,8 @@ Failures of devices are `drivers.errors.DriverError`. A message names the place,
 value and the requirement, then the remedy.
 """
 
+from typing import Any
+
 
 class DaqError(Exception):
     """Root of the tree."""
@@ -37,3 +39,9 @@ class CorruptFile(StoreError):
 
 class CampaignError(DaqError):
     """A campaign cannot start or cannot go on."""
+
+
+def told(value: Any) -> str:
+    """``=value`` of a number or a short text, for an error's sentence; of anything else nothing."""
+    short = isinstance(value, str) and len(value) <= 60
+    return f"={value!r}" if short or isinstance(value, (bool, int, float)) else ""

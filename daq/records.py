@@ -14,6 +14,7 @@ from drivers.types import Channel
 Kind = Literal["free", "forced", "cold"]
 Role = Literal["fit", "validation"]
 ExitStatus = Literal["success", "not_entrained", "failed", "aborted", "interrupted"]
+Verdict = Literal["no_discrepancy", "traced", "ambiguous", "unexplained"]  # as identify's
 Dtype = Literal["int16", "int32", "float32", "float64"]
 
 

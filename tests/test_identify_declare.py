@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from daq import records
 from daq.cli import app
 from daq.importers import open_campaign
 from daq.importers.folder import Flame, Nonlinearity
@@ -23,6 +24,7 @@ from identify.load import load_campaign
 from identify.profile import intervals
 from identify.record import DeclaredModel
 from identify.residual import OrbitResidual
+from identify.results import Verdict
 from identify.trace.usable import usable
 from tests.identify_coefficients import WIDE, clean, drawn
 
@@ -97,6 +99,10 @@ def test_every_word_that_a_campaign_may_declare_is_a_model() -> None:
         structure = declared_structure(DeclaredModel(flame=flame, nonlinearity=nonlinearity))
         assert described(structure).flame == flame
         assert structure.nonlinearity == nonlinearity
+
+
+def test_the_verdicts_that_lists_are_filtered_by_are_those_there_are() -> None:
+    assert get_args(records.Verdict) == get_args(Verdict)
 
 
 def test_a_flame_without_a_pole_has_none_that_drifts() -> None:

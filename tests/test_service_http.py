@@ -74,9 +74,56 @@ def test_unknown_route_method_and_value_are_problems(open_server: Running) -> No
     with open_server.client() as client:
         assert problem(client.get("/nothing"))["type"] == "/problems/not-found"
         assert problem(client.put("/health"))["type"] == "/problems/method"
-        assert problem(client.get("/rigs/none"))["detail"] == "there is no rig 'none'"
+        assert (
+            problem(client.get("/rigs/none"))["detail"]
+            == "there is no rig 'none'; there is simulated"
+        )
         wrong = problem(client.post("/rigs/simulated/lock", json={"takeover": True, "x": 1}))
         assert wrong["errors"] == [{"where": "body.x", "what": "Extra inputs are not permitted"}]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "says"),
+    [
+        ("GET", "/campaigns?bogus=1", None, "query parameter 'bogus' is not known here; there are"),
+        ("GET", "/health?bogus=1", None, "'bogus' is not known here; there are none"),
+        (
+            "POST",
+            "/campaigns/x/diagnoses?within_minutes=nan",
+            None,
+            "'within_minutes' is not known",
+        ),
+        ("POST", "/campaigns/x/diagnoses", {"within": -1}, "body: this request takes none"),
+        ("GET", "/runs?kind=zz", None, "query.kind='zz': Input should be 'free', 'forced' or"),
+        (
+            "GET",
+            "/runs?min_frequency_hz=nan",
+            None,
+            "query.min_frequency_hz='nan': Input should be",
+        ),
+        ("GET", "/jobs?state=zz", None, "query.state='zz': Input should be 'queued'"),
+        ("GET", "/jobs?kind=zz", None, "query.kind='zz': Input should be 'campaign'"),
+        ("GET", "/campaigns?verdict=zz", None, "query.verdict='zz': Input should be 'no_discre"),
+        ("GET", "/campaigns?limit=0", None, "query.limit='0': Input should be greater than or"),
+        ("POST", "/rigs/simulated/watch", {"seconds": -1}, "body.seconds=-1: Input should be gre"),
+        ("POST", "/rigs/simulated/watch", {"password": "x"}, "body.password: Extra inputs are"),
+    ],
+)
+def test_what_would_be_passed_over_is_refused(
+    open_server: Running, method: str, path: str, body: dict[str, object] | None, says: str
+) -> None:
+    with open_server.client() as client:
+        refused = problem(client.request(method, path, json=body))
+    assert refused["status"] == 422
+    assert says in str(refused["detail"])
+
+
+def test_a_body_that_is_no_json_is_named(open_server: Running) -> None:
+    with open_server.client() as client:
+        headers = {"Content-Type": "text/plain"}
+        refused = problem(client.post("/rigs/simulated/watch", content="{}", headers=headers))
+    assert refused["status"] == 415
+    assert "Content-Type='text/plain' is not application/json" in str(refused["detail"])
 
 
 def test_scopes(keyed: tuple[Running, dict[str, str]]) -> None:

@@ -51,7 +51,9 @@ def test_explain_names_every_source(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     [
         ("[server]\nprot = 1\n", "server.prot"),
         ("sever = 1\n", "sever"),
-        ("[server]\nport = 70000\n", "server.port"),
+        ("[server]\nport = 70000\n", "server.port=70000: "),
+        ("[server]\nport = 'x'\n", "server.port='x': "),
+        ("a = " + 5000 * "[", "nested too deeply"),
         ("[server]\ntls_key = 'a'\n", "tls_certificate"),
         ("[server\n", "TOML"),
     ],
@@ -79,3 +81,5 @@ def test_a_wrong_variable_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_file_that_was_asked_for_must_exist(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="does not exist"):
         load(tmp_path / "absent.toml")
+    with pytest.raises(ConfigError, match="is no file"):
+        load(tmp_path)

@@ -9,7 +9,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from fastapi import APIRouter, FastAPI
+from fastapi import APIRouter, Depends, FastAPI
 from fastapi.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
@@ -33,6 +33,7 @@ from daq.service import (
     routes_upkeep,
     wire,
 )
+from daq.service.asked import only_asked
 from daq.service.guard import Guard
 from daq.service.settings import Settings
 from daq.service.state import Service, build
@@ -101,7 +102,9 @@ def create_api(service: Service) -> FastAPI:
     app.state.hide = service.jobs.hide
     problems.install(app)
     for router in ROUTERS:
-        app.include_router(router, prefix=PREFIX, responses=REFUSALS)
+        app.include_router(
+            router, prefix=PREFIX, responses=REFUSALS, dependencies=[Depends(only_asked)]
+        )
     app.mount("/", StaticFiles(directory=PAGE, html=True), name="page")
     return app
 

@@ -7,6 +7,7 @@ shows no internals; the log holds the trace under the same request number.
 """
 
 import logging
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from fastapi import FastAPI, Request
@@ -14,7 +15,15 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 
-from daq.errors import CampaignError, CorruptFile, DaqError, InputError, StoreError, UnknownItem
+from daq.errors import (
+    CampaignError,
+    CorruptFile,
+    DaqError,
+    InputError,
+    StoreError,
+    UnknownItem,
+    told,
+)
 from daq.service.rigs import RigConflict
 from drivers.errors import (
     DeviceNotFound,
@@ -105,9 +114,12 @@ class Problem(Exception):
         )
 
 
-def not_found(what: str, name: str) -> Problem:
-    """A 404 that says what was looked for."""
-    return Problem(404, "not-found", f"there is no {what} {name!r}")
+def not_found(what: str, name: str, known: Iterable[str] = ()) -> Problem:
+    """A 404 that says what was looked for, and what there is where that is short."""
+    there = ", ".join(list(known)[:20])
+    return Problem(
+        404, "not-found", f"there is no {what} {name!r}" + (f"; there is {there}" if there else "")
+    )
 
 
 def request_id(request: Request) -> str | None:
@@ -130,6 +142,14 @@ def from_daq(error: DaqError, hide: str) -> Problem:
         if isinstance(error, family):
             return Problem(status, kind, detail)
     return Problem(500, "daq", detail)
+
+
+def _given(error: Mapping[str, Any]) -> str:
+    """``=value`` of what was refused, where that is plain; not of a header or an unknown field,
+    which may hold a secret."""
+    if error["loc"][0] == "header" or error["type"] in ("missing", "extra_forbidden"):
+        return ""
+    return told(error.get("input"))
 
 
 def install(app: FastAPI) -> None:
@@ -167,9 +187,13 @@ def install(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def _validation(request: Request, error: RequestValidationError) -> Response:
-        # pydantic's own error holds the input; it is left out, since it may hold a secret.
+        sent = request.headers.get("content-type", "")
+        whole = any(tuple(e["loc"]) == ("body",) for e in error.errors())
+        if whole and sent and "json" not in sent:
+            detail = f"Content-Type={sent[:100]!r} is not application/json: send the body as JSON"
+            return Problem(415, "content-type", detail).response(request_id(request))
         errors = [
-            {"where": ".".join(str(part) for part in e["loc"]), "what": e["msg"]}
+            {"where": ".".join(str(part) for part in e["loc"]) + _given(e), "what": e["msg"]}
             for e in error.errors()
         ]
         detail = "; ".join(f"{e['where']}: {e['what']}" for e in errors[:3])

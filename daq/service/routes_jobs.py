@@ -1,15 +1,26 @@
 """Jobs: what runs, how far it is, what came out, and how to end it."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 
-from daq.service.jobs import Job
+from daq.service.jobs import Job, State
 from daq.service.problems import Problem, not_found
 from daq.service.state import Controller, Parts, Reader, Service
 from daq.service.wire import JobSummary, Page
 
 router = APIRouter(tags=["jobs"])
+JobKind = Literal[
+    "campaign",
+    "watch",
+    "close_loop",
+    "import",
+    "identification",
+    "diagnosis",
+    "characterisation",
+    "verification",
+    "export",
+]
 
 
 def find(service: Service, identifier: str) -> Job:
@@ -29,8 +40,8 @@ def shown(job: Job) -> JobSummary:
 async def jobs(
     service: Parts,
     who: Reader,
-    kind: Annotated[str | None, Query(max_length=50)] = None,
-    state: Annotated[str | None, Query(max_length=20)] = None,
+    kind: JobKind | None = None,
+    state: State | None = None,
     after: Annotated[str | None, Query(max_length=20)] = None,
     limit: Annotated[int, Query(ge=1, le=200)] = 50,
 ) -> Page[JobSummary]:

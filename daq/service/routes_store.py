@@ -11,6 +11,7 @@ from typing import Annotated, Any, TypeVar
 from fastapi import APIRouter, Header, Path, Query, Response
 from fastapi.responses import StreamingResponse
 
+from daq.records import ExitStatus, Kind, Role, Verdict
 from daq.service import run_data
 from daq.service.problems import Problem
 from daq.service.state import Parts, Reader, Service
@@ -21,6 +22,7 @@ router = APIRouter(tags=["campaigns"])
 Id = Annotated[str, Path(max_length=200, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Name = Annotated[str, Path(max_length=200, pattern=r"^[^/\\\x00-\x1f]+$")]
 Text = Annotated[str | None, Query(max_length=200)]
+Hertz = Annotated[float | None, Query(ge=0, allow_inf_nan=False)]
 Frame = Annotated[int, Query(ge=0, le=1 << 53)]
 Stop = Annotated[int | None, Query(ge=1, le=1 << 53)]
 Limit = Annotated[int, Query(ge=1, le=500)]
@@ -50,7 +52,7 @@ class NotModified(Problem):
 def campaigns(
     service: Parts,
     who: Reader,
-    verdict: Text = None,
+    verdict: Verdict | None = None,
     after: Text = None,
     limit: Limit = 50,
 ) -> Page[Campaign]:
@@ -84,14 +86,14 @@ def runs(
     who: Reader,
     campaign: Text = None,
     rig: Text = None,
-    kind: Text = None,
-    role: Text = None,
-    exit_status: Text = None,
-    min_frequency_hz: Annotated[float | None, Query()] = None,
-    max_frequency_hz: Annotated[float | None, Query()] = None,
+    kind: Kind | None = None,
+    role: Role | None = None,
+    exit_status: ExitStatus | None = None,
+    min_frequency_hz: Hertz = None,
+    max_frequency_hz: Hertz = None,
     since: Text = None,
     until: Text = None,
-    verdict: Text = None,
+    verdict: Verdict | None = None,
     after: Text = None,
     limit: Limit = 50,
 ) -> Page[Run]:
@@ -182,7 +184,7 @@ def spectrum(
     channel: Text = None,
     start: Frame = 0,
     stop: Stop = None,
-    max_hz: Annotated[float | None, Query(gt=0)] = None,
+    max_hz: Annotated[float | None, Query(gt=0, allow_inf_nan=False)] = None,
     points: Annotated[int, Query(ge=1, le=50_000)] = 4000,
 ) -> Spectrum:
     """Amplitude spectrum (Hann window), thinned to `points` without losing a line."""

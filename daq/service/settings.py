@@ -9,7 +9,6 @@ The file is the first of: the ``--config`` option, ``ENTRAIN_CONFIG``, ``./entra
 """
 
 import os
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from daq.documents import read_document
+from daq.errors import InputError, told
 
 PREFIX = "ENTRAIN_"
 # Variables of the same prefix that are no settings: the file's place, and the tests' own switch.
@@ -177,7 +179,8 @@ def find_file(explicit: Path | None = None) -> Path | None:
     asked = explicit or (Path(p) if (p := os.environ.get("ENTRAIN_CONFIG")) else None)
     if asked is not None:
         if not asked.is_file():
-            raise ConfigError(f"configuration file {str(asked)!r} does not exist")
+            what = "is no file" if asked.exists() else "does not exist"
+            raise ConfigError(f"configuration file {str(asked)!r} {what}")
         return asked
     home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     places = (Path("entrain.toml"), home / "entrain" / "entrain.toml")
@@ -189,9 +192,9 @@ def read_file(path: Path | None) -> dict[str, Any]:
     if path is None:
         return {}
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError) as error:
-        raise ConfigError(f"{path}: not a readable TOML file: {error}") from error
+        return read_document(path)
+    except (InputError, OSError) as error:
+        raise ConfigError(str(error)) from error
 
 
 def _environment() -> dict[str, str]:
@@ -245,9 +248,10 @@ def load(explicit: Path | None = None, **overrides: Any) -> Settings:
             changed = type(part).model_validate({**part.model_dump(), leaf: value})
             settings = settings.model_copy(update={head: changed})
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
+        first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in first["loc"]) or "settings"
-        raise ConfigError(f"{_source(key, table, path)}: {key}: {first['msg']}") from error
+        given = told(first["input"])
+        raise ConfigError(f"{_source(key, table, path)}: {key}{given}: {first['msg']}") from error
     return settings
 
 

@@ -60,7 +60,7 @@ class Service:
         """The rig of that name, or the 404 that says there is none."""
         entry = self.rigs.get(name)
         if entry is None:
-            raise not_found("rig", name)
+            raise not_found("rig", name, self.rigs.names())
         return entry
 
     def facts(self, name: str) -> RigFacts:

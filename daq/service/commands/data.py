@@ -1,7 +1,7 @@
 """`entrain import`, `entrain store`, `entrain campaign list` and `show`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, get_args
 
 import typer
 from rich.markup import escape
@@ -114,6 +114,11 @@ def list_campaigns(
     after: Annotated[str | None, typer.Option(help="Continue behind this id.")] = None,
 ) -> None:
     """List the campaigns of the run store."""
+    from daq.errors import InputError
+    from daq.records import Verdict
+
+    if verdict is not None and verdict not in get_args(Verdict):
+        raise InputError(f"--verdict={verdict!r} is not one of {', '.join(get_args(Verdict))}")
     with open_store(store) as source:
         rows = source.campaigns(after=after, limit=limit, verdict=verdict)
     if not rows:
