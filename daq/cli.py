@@ -5,6 +5,7 @@ line on standard error; ``--debug`` shows the trace instead.
 """
 
 import sys
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated
 
@@ -80,11 +81,20 @@ def options(
     use_config(config)
 
 
+INTERRUPTED = 130  # what typer makes of Ctrl-C, without a word
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     words = sys.argv[1:] if arguments is None else arguments
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # what a terminal cannot show
     try:
         app(args=words)
+    except SystemExit as ended:
+        if ended.code == INTERRUPTED:
+            sys.stderr.write("entrain: interrupted\n")
+        raise
     except Exception as error:
         if "--debug" in words:
             raise

@@ -153,7 +153,10 @@ class Runner:
         """Note why the campaign broke off; never hides `error` behind another."""
         self.rig.silence()
         with contextlib.suppress(DaqError):
-            self.emit("failed", None, {"reason": f"{type(error).__name__}: {error}"})
+            reason = f"{type(error).__name__}: {error}"
+            if isinstance(error, KeyboardInterrupt):
+                reason = "interrupted at the keyboard"
+            self.emit("failed", None, {"reason": reason})
         with contextlib.suppress(DaqError):
             self.store.set_status(self.campaign, status="failed")
 

@@ -1,6 +1,7 @@
 """The command line on recorded data, keys and configuration, as a user calls it."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -41,6 +42,28 @@ def test_import_list_show_rebuild(home: Path, capfd: pytest.CaptureFixture[str])
     code, out, _ = entrain(capfd, "campaign", "show", campaign)
     assert "validation" in out
     assert entrain(capfd, "store", "rebuild")[0] == 0
+
+
+def test_what_a_terminal_cannot_show_is_replaced() -> None:
+    for words in (["effects", "flame_delay"], ["effects", "flame_delay", "--json", "-"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "daq.cli", *words],
+            env={**os.environ, "PYTHONIOENCODING": "ascii"},
+            capture_output=True,
+        )
+        assert (done.returncode, done.stderr) == (0, b"")
+        assert b"flame_delay" in done.stdout
+    assert json.loads(done.stdout)["effects"]
+
+
+def test_a_key_that_interrupts_is_told(
+    home: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("daq.importers.open_campaign", interrupted)
+    assert entrain(capfd, "campaign", "show", "x") == (130, "", "entrain: interrupted\n")
 
 
 def test_import_of_a_single_recording(home: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -129,6 +129,7 @@ def test_check_finds_the_simulated_rig_fit(
         (("identify", "/nowhere"), "/nowhere"),
         (("diagnose", "nothing"), "nothing"),
         (("characterise", "absent.txt"), "absent.txt"),
+        (("campaign", "show", ""), "campaign='' is no campaign"),
         (("campaign", "list", "--verdict", "bogus"), "--verdict='bogus' is not one of no_discrep"),
         (("characterise", "/tmp"), "/tmp: is a folder: give a file"),
         (("characterise", "/dev/null"), "/dev/null: is a pipe or a device: give a file"),

@@ -160,7 +160,7 @@ def test_an_id_is_looked_up_and_a_missing_one_named(tmp_path: Path, store: RunSt
     assert open_campaign(card.id, store) == store.campaign_dir(card.id)
     for wrong in ("nowhere", "../store", ""):
         with pytest.raises(UnknownItem, match="campaign"):
-            open_campaign(wrong or "nothing", store)
+            open_campaign(wrong, store)
     with pytest.raises(LoadError, match=r"campaign\.json"):
         load_campaign(tmp_path)
 

@@ -24,6 +24,8 @@ def open_campaign(path_or_id: str | Path, store: RunStore | None = None) -> Path
     InputError
         A campaign folder that is not usable: the message says what and where.
     """
+    if not str(path_or_id):
+        raise UnknownItem("campaign='' is no campaign: give a folder, or an id of the run store")
     folder = Path(path_or_id).expanduser()
     if folder.is_dir():
         if (folder / "campaign.json").exists() and not (folder / "campaign.toml").exists():

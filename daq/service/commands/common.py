@@ -145,8 +145,10 @@ def write_json(place: Path | None, content: dict[str, Any]) -> None:
 
     if place is None:
         return
-    text = json.dumps(plain(content), indent=2, ensure_ascii=False, allow_nan=False)
-    if str(place) == "-":
+    to_terminal = str(place) == "-"
+    ascii_ = to_terminal and not sys.stdout.encoding.lower().startswith("utf")
+    text = json.dumps(plain(content), indent=2, ensure_ascii=ascii_, allow_nan=False)
+    if to_terminal:
         sys.stdout.write(text + "\n")
     else:
         place.write_text(text + "\n", encoding="utf-8")
