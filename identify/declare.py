@@ -60,10 +60,10 @@ def read_model(path: Path | str) -> Structure:
     """
     file = Path(path)
     try:
-        content = tomllib.loads(file.read_text("utf-8"))
+        content = tomllib.loads(file.read_text("utf-8-sig"))
     except OSError as error:
         raise ModelError(f"{file}: cannot be read ({error.strerror}); give a model file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ModelError(f"{file}: not TOML: {error}") from error
     try:
         return structure_of(content)

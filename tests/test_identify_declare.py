@@ -68,6 +68,8 @@ def test_every_element_can_be_declared_at_its_place() -> None:
             ["channel_mismatch.gain", "declare one of them"],
         ),
         ("format = model", ["not TOML"]),
+        (f"a = {5000 * '['}", ["not TOML"]),
+        ('\ufeffformat = "model/2"', ["'model/2'", "'model/1'"]),
     ],
 )
 def test_what_is_wrong_is_named_with_the_file(text: str, words: list[str], tmp_path: Path) -> None:

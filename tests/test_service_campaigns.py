@@ -150,6 +150,7 @@ def test_what_a_dry_run_finds_is_not_started(
         ({"rig": "none"}, 404, "'none'"),
         ({"rig": "quick", "plan": {"conditions": [{"offset": 0.1, "x": 1}]}}, 422, "x=1"),
         ({"rig": "quick", "plan": {"record_s": -1}}, 422, "record_s=-1"),
+        ({"rig": "quick", "plan": {"online": {"wanted": {"x": 0.1}}}}, 422, "'x' is not a param"),
         ({"rig": "quick", "speaker": "loud"}, 422, "speaker"),
     ],
 )

@@ -12,7 +12,7 @@ from daq.service.campaign_names import new_name
 from daq.service.control import lane
 from daq.service.dry_run import dry_run, require_possible
 from daq.service.jobs import Job
-from daq.service.plan_facts import planned
+from daq.service.plan_facts import planned, require_parameters
 from daq.service.problems import Problem
 from daq.service.rigs import RigEntry
 from daq.service.routes_jobs import find, shown
@@ -85,8 +85,10 @@ def rehearse(body: CampaignRequest, service: Parts, who: Reader) -> DryRun:
     service.check_rig(body.rig)
     plan = parse_plan(body.plan)
     expected: list[dict[str, Any]] = []
+    if plan.online is not None:
+        service.planner.ask(require_parameters, plan)
     rig = service.facts(body.rig)
-    if plan.design is not None or plan.continues is not None or plan.online is not None:
+    if plan.design is not None or plan.continues is not None:
         store = str(service.settings.store_dir)
         plan, expected = service.planner.ask(planned, body.plan, store)
     report = dry_run(
@@ -103,6 +105,8 @@ def rehearse(body: CampaignRequest, service: Parts, who: Reader) -> DryRun:
 
 def require_runnable(service: Service, rig: str, plan: Plan) -> None:
     """Refuse with 422 a plan whose dry run finds problems, before it is queued."""
+    if plan.online is not None:
+        service.planner.ask(require_parameters, plan)
     known = service.facts(rig)
     require_possible(
         dry_run(plan, known.limits, known.sample_rate_hz, known.channels, operating=known.operating)
