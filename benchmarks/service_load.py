@@ -205,7 +205,7 @@ async def load(
 def wait_for(address: str) -> None:
     """Until the acquisition runs: its process imports first."""
     while True:
-        jobs = httpx.get(f"{address}/api/v1/jobs", params={"kind": "acquire"}).json()["items"]
+        jobs = httpx.get(f"{address}/api/v1/jobs").json()["items"]
         if jobs and jobs[0]["message"] == "acquiring":
             return
         time.sleep(0.1)

@@ -180,3 +180,6 @@ def test_characterise_a_plain_sine(home: Path, capfd: pytest.CaptureFixture[str]
     # Amplitude 1 at 100 Hz; noise of 0.01 over 20 000 samples leaves 1e-4 of uncertainty.
     assert found["frequency_hz"]["value"] == pytest.approx(100.0, abs=1e-2)
     assert found["amplitude"]["value"] == pytest.approx(1.0, abs=1e-2)
+    wavfile.write(home / "sine.wav", 2000, np.sin(2 * np.pi * 100 * time).astype(np.float32))
+    code, _, err = entrain(capfd, "characterise", home / "sine.wav", "--rate-hz", "5000")
+    assert (code, "rate_hz=5000 is not the file's own, 2000" in err) == (2, True), err

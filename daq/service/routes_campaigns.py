@@ -104,13 +104,16 @@ def rehearse(body: CampaignRequest, service: Parts, who: Reader) -> DryRun:
 
 
 def require_runnable(service: Service, rig: str, plan: Plan) -> None:
-    """Refuse with 422 a plan whose dry run finds problems, before it is queued."""
+    """Refuse with 422 a plan whose dry run finds problems, before it is queued.
+
+    A device that was never looked at is not opened for it: its campaign then ends before it moves.
+    """
     if plan.online is not None:
         service.planner.ask(require_parameters, plan)
-    known = service.facts(rig)
-    require_possible(
-        dry_run(plan, known.limits, known.sample_rate_hz, known.channels, operating=known.operating)
-    )
+    known = service.known(rig)
+    if known is not None:
+        limits, rate, channels = known.limits, known.sample_rate_hz, known.channels
+        require_possible(dry_run(plan, limits, rate, channels, operating=known.operating))
 
 
 @router.post("/campaigns", status_code=202)

@@ -79,6 +79,11 @@ class Service:
         self.seen[name] = self.aside.ask(rig_facts.facts, entry)
         return self.seen[name]
 
+    def known(self, name: str) -> RigFacts | None:
+        """The same as far as it can be told without opening a device."""
+        simulated = self.check_rig(name).driver == SIMULATED
+        return self.facts(name) if simulated else self.seen.get(name)
+
 
 def build(settings: Settings) -> Service:
     """All parts, wired."""
