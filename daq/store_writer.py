@@ -3,16 +3,19 @@
 The file exists as ``.NAME.h5.partial`` while it grows and can be read meanwhile
 (``h5py.File(path, swmr=True)``); it takes its own name only when it is complete. After a kill the
 partial file still opens in SWMR mode and holds all but the blocks since the last flush
-(`daq.store_recovery` salvages it). A failure in the thread (disk full) surfaces at the next
-`append` or at `finish`, never silently.
+(`daq.store_upkeep` salvages it). A failure in the thread (disk full) surfaces at the next
+`append` or at `finish`, never silently, and leaves the partial file as a kill would.
 """
 
+import contextlib
 import hashlib
 import json
 import os
 import queue
+import re
+import shutil
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -32,6 +35,7 @@ from drivers.types import Flag
 MAX_QUEUED_BYTES = 256 * 2**20  # some 150 s of 8 channels at 51.2 kHz float32
 DISK_ERRORS = (OSError, RuntimeError)  # HDF5 raises either where a disk is full
 MAX_FILLED_GAP_S = 60.0
+SPARE_BYTES = 2**20  # left free on the disk: for HDF5's own, and for saying how the campaign ended
 
 
 @dataclass(frozen=True)
@@ -99,11 +103,20 @@ class RunWriter:
             raise StoreError(f"{path}: a run of that name exists; runs are never overwritten")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = h5py.File(partial_path(path), "w", libver="latest", locking=False)
+            self._require_room()
+            self._file = h5py.File(partial_path(path), "x", libver="latest", locking=False)
             write_layout(self._file, header, campaign, software_version())
+            # Held open: what fails as a data set is closed would be lost without an error.
+            self._samples = self._file["entry/data/samples"]
+            self._n_valid = self._file["entry/quality/n_valid"]
             self._file.swmr_mode = True
+        except FileExistsError as error:
+            raise StoreError(
+                f"{partial_path(path)}: was left by a recording that broke off; "
+                "`entrain store recover` keeps what is in it"
+            ) from error
         except DISK_ERRORS as error:
-            raise StoreError(f"{path}: cannot be written ({error})") from error
+            raise StoreError(f"{path}: cannot be written ({_reason(error)})") from error
         self._thread = threading.Thread(target=self._work, name=f"writer {path.stem}", daemon=True)
         self._thread.start()
 
@@ -194,7 +207,7 @@ class RunWriter:
             if self._durable:
                 sync_folder(self.path.parent)
         except DISK_ERRORS as error:
-            raise StoreError(f"{self.path}: cannot be completed ({error})") from error
+            raise StoreError(f"{self.path}: cannot be completed ({_reason(error)})") from error
         self._summary = summarise(
             self.header,
             self.campaign,
@@ -227,6 +240,9 @@ class RunWriter:
             self.finish("aborted", "left without an outcome")
         elif not isinstance(error, StoreError):
             self.finish("failed", f"{type(error).__name__}: {error}")
+        else:
+            self._stop_thread()
+            self._let_go()
 
     def _expected(self, first: int = 0) -> int:
         return first if self._next_frame is None else self._next_frame
@@ -234,8 +250,8 @@ class RunWriter:
     def _raise_failure(self) -> None:
         if self._error is not None:
             raise StoreError(
-                f"{self.path}: cannot be written ({self._error}); what was flushed is in "
-                f"{partial_path(self.path).name}"
+                f"{self.path}: cannot be written ({_reason(self._error)}); what was recorded so "
+                f"far is in {partial_path(self.path).name}; `entrain campaign resume` goes on"
             ) from self._error
 
     def _stop_thread(self) -> None:
@@ -250,16 +266,35 @@ class RunWriter:
             ended = False
             while not ended:
                 batch, ended = self._collect()
+                self._require_room(batch)
                 for piece in batch:
                     origin = piece.first_frame if origin is None else origin
                     self._write(piece, piece.first_frame - origin)
                 if batch:
-                    self._file["entry/quality/n_valid"][()] = self._written
+                    self._file.flush()
+                    self._n_valid[()] = self._written  # not before these frames are in the file
                     self._file.flush()
         except BaseException as error:
+            self._let_go()
             with self._room:
                 self._error = error
                 self._room.notify_all()
+
+    def _let_go(self) -> None:
+        """Close a file that cannot be written, and leave it on the disk as a kill would.
+
+        What HDF5 still has in hand goes nowhere: a close that fails spoils the file, and ends the
+        process later (a segmentation fault).
+        """
+        with contextlib.suppress(*DISK_ERRORS), open(os.devnull, "r+b") as nowhere:
+            os.dup2(nowhere.fileno(), self._file.id.get_vfd_handle())
+        with contextlib.suppress(*DISK_ERRORS):
+            self._file.close()
+
+    def _require_room(self, batch: Sequence[_Piece] = ()) -> None:
+        wanted = SPARE_BYTES + sum(piece.samples.nbytes for piece in batch)
+        if (free := shutil.disk_usage(self.path.parent).free) < wanted:
+            raise OSError(f"the disk is full, {free / 2**20:.1f} MiB are left: make room")
 
     def _collect(self) -> tuple[list[_Piece], bool]:
         """Wait for a piece, then take what else is there, up to one flush interval's worth."""
@@ -276,7 +311,7 @@ class RunWriter:
         return batch, True
 
     def _write(self, piece: _Piece, position: int) -> None:
-        samples = self._file["entry/data/samples"]
+        samples = self._samples
         end = position + len(piece.samples)
         samples.resize(end, axis=0)
         if position > self._written:
@@ -295,6 +330,12 @@ class RunWriter:
         with self._room:
             self._queued_bytes -= piece.samples.nbytes
             self._room.notify_all()
+
+
+def _reason(error: BaseException) -> str:
+    """Why in a few words: HDF5 says it in ten lines, the system's own words among them."""
+    found = re.search(r"error message = '([^']*)'", str(error))
+    return found[1] if found else str(error)
 
 
 def _append_row(dataset: h5py.Dataset, row: tuple[int, ...]) -> None:
