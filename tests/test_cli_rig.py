@@ -1,6 +1,14 @@
 """The command line on a simulated rig: dry run, campaign, resume, check, devices."""
 
+import contextlib
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from shutil import copytree
 
@@ -8,6 +16,10 @@ import numpy as np
 import pytest
 from scipy.io import wavfile
 
+from daq.errors import CorruptFile
+from daq.journal import read_journal
+from daq.store import read_card
+from daq.store_file import open_run, read_summary
 from tests.test_cli_data import entrain, home  # noqa: F401  (a fixture)
 
 PLAN = """title = "quick"
@@ -183,3 +195,88 @@ def test_characterise_a_plain_sine(home: Path, capfd: pytest.CaptureFixture[str]
     wavfile.write(home / "sine.wav", 2000, np.sin(2 * np.pi * 100 * time).astype(np.float32))
     code, _, err = entrain(capfd, "characterise", home / "sine.wav", "--rate-hz", "5000")
     assert (code, "rate_hz=5000 is not the file's own, 2000" in err) == (2, True), err
+
+
+CAMPAIGN = 'title = "cut off"\nrecord_s = 1.5\nconditions = [{ offset = 0.02 }]\n'
+RIGS = """[rigs.real]
+driver = "simulated"
+options = { clock = "realtime" }
+"""
+
+
+@contextmanager
+def recording(home: Path, terminal: int | None = None) -> Iterator[subprocess.Popen[bytes]]:  # noqa: F811
+    """A campaign in a process of its own, which has begun to write its first run."""
+    (home / "entrain.toml").write_text(RIGS, encoding="utf-8")
+    (home / "plan.toml").write_text(CAMPAIGN, encoding="utf-8")
+    words = [sys.executable, "-m", "daq.cli", "campaign", "run", "plan.toml", "--rig", "real"]
+    child = subprocess.Popen(
+        words,
+        stdin=terminal,
+        stdout=terminal if terminal is not None else subprocess.DEVNULL,
+        stderr=terminal if terminal is not None else subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent.parent)},
+        start_new_session=True,
+    )
+    try:
+        end = time.monotonic() + 60
+        while written_frames(home) < 2000:
+            assert child.poll() is None, "the campaign ended before it recorded"
+            assert time.monotonic() < end
+            time.sleep(0.02)
+        yield child
+    finally:
+        child.kill()
+        child.wait()
+
+
+def written_frames(home: Path) -> int:  # noqa: F811
+    for path in home.glob("data/**/.*.h5.partial"):
+        with contextlib.suppress(CorruptFile), open_run(path, live=True) as file:
+            return int(file["entry/quality/n_valid"][()])
+    return 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="kill -9 is POSIX's")
+def test_going_on_after_a_kill_keeps_what_was_recorded(
+    home: Path,  # noqa: F811
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    with recording(home) as child:
+        child.kill()
+        child.wait()
+    (folder,) = home.glob("data/**/campaigns/*")
+    (home / "entrain.toml").write_text(RIGS.replace("realtime", "virtual"), encoding="utf-8")
+    code, _, err = entrain(capfd, "campaign", "resume", folder.name)
+    assert code == 0, err
+    runs = [read_summary(path, folder.name) for path in (folder / "runs").iterdir()]
+    broken_off, anew, _ = sorted(runs, key=lambda run: len(run.name))
+    assert (broken_off.name, broken_off.exit_status) == ("000-free", "interrupted")
+    assert broken_off.samples >= 2000
+    assert (anew.name, anew.exit_status) == ("000-free-2", "success")
+    assert entrain(capfd, "store", "verify")[0] == 0
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the signals are POSIX's")
+@pytest.mark.parametrize("strike", [signal.SIGTERM, "hang up"])
+def test_whatever_ends_a_campaign_is_recorded_as_its_end(
+    home: Path,  # noqa: F811
+    strike: int | str,
+) -> None:
+    keyboard, terminal = os.openpty()
+    with recording(home, terminal) as child:
+        os.close(terminal)
+        if strike == "hang up":
+            os.close(keyboard)
+            os.kill(child.pid, signal.SIGHUP)
+        else:
+            os.kill(child.pid, signal.SIGTERM)
+        assert child.wait(30) == 1  # as after Ctrl-C: not complete
+    if strike != "hang up":
+        os.close(keyboard)
+    (folder,) = home.glob("data/**/campaigns/*")
+    last = read_journal(folder / "journal.jsonl")[-1]
+    assert (last["kind"], last["data"]["status"]) == ("finished", "stopped")
+    assert "ended by SIG" in last["data"]["reason"]
+    assert read_card(folder / "campaign.json").status == "stopped"
+    assert list((folder / "runs").glob(".*.partial")) == []

@@ -4,8 +4,10 @@ A key takes effect at the campaign's next window; a pause silences the speaker f
 input is no terminal, or the system has no termios, only Ctrl-C is left.
 """
 
+import contextlib
 import os
 import select
+import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +21,7 @@ RAMPED_S = 0.05  # beyond the ramp to silence
 
 
 class Keyboard:
-    """What was typed at `descriptor`, as a campaign's `control`; `interrupted` tells of Ctrl-C."""
+    """What was typed at `descriptor`, as a campaign's `control`; `interrupted` lists signals."""
 
     def __init__(self, rig: DuplexRig, descriptor: int | None, interrupted: list[int]) -> None:
         self._rig = rig
@@ -41,7 +43,7 @@ class Keyboard:
                     # Also a pause that is taken back at once must be seen: by the silence.
                     self._rig.clock.sleep(self._rig.limits.silence_ramp_s + RAMPED_S)
             if self._interrupted:
-                raise StopRequested("interrupted at the keyboard")
+                raise StopRequested(why_ended(self._interrupted))
             if not paused:
                 return
 
@@ -49,6 +51,13 @@ class Keyboard:
         if self._descriptor is None or not select.select([self._descriptor], [], [], wait_s)[0]:
             return ""
         return os.read(self._descriptor, 64).decode("ascii", "ignore").lower()
+
+
+def why_ended(signals: list[int]) -> str:
+    """What the first of the signals that ask for an end says of it."""
+    if signals[0] == signal.SIGINT:
+        return "interrupted at the keyboard"
+    return f"ended by {signal.Signals(signals[0]).name}"
 
 
 @contextmanager
@@ -69,4 +78,5 @@ def single_keys() -> Iterator[int | None]:
     try:
         yield descriptor
     finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+        with contextlib.suppress(termios.error):  # the terminal is gone
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)

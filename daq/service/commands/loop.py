@@ -94,6 +94,7 @@ def close_loop(
     from daq.errors import InputError
     from daq.service import loop_work
     from daq.service.campaign_names import begun_with, new_name
+    from daq.service.commands.keyboard import why_ended
     from daq.service.laid import laid_over, over
     from daq.service.rig_facts import truth
     from daq.service.rigs import SIMULATED, open_rig
@@ -108,7 +109,7 @@ def close_loop(
 
     def heed() -> None:
         if stop:
-            raise StopRequested("interrupted at the keyboard")
+            raise StopRequested(why_ended(stop))
 
     given: dict[str, Any] = {} if seed is None else {"seed": seed}
     if sealed:

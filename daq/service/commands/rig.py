@@ -1,5 +1,7 @@
 """`entrain campaign run`, `dry-run` and `resume`: a campaign in this process, in this terminal."""
 
+import contextlib
+import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -37,6 +39,7 @@ PlanArgument = Annotated[
 ]
 SeedOption = Annotated[int | None, typer.Option(help="Seed, for a simulated rig.")]
 
+HANG_UP: "signal.Signals | None" = getattr(signal, "SIGHUP", None)
 RING_DOWN_S = 5.0  # a tube whose flame went out
 
 
@@ -213,6 +216,10 @@ class CampaignView:
 
     def tell(self, event: "Event") -> None:
         """`run_campaign`'s `on_event`."""
+        with contextlib.suppress(OSError):  # a terminal that is gone; its hang-up ends the campaign
+            self._show(event)
+
+    def _show(self, event: "Event") -> None:
         from daq.service.rig_work import describe
 
         if event.kind == "window":
@@ -290,18 +297,33 @@ def _campaign(
 
 @contextmanager
 def interruptible(pressed: list[int]) -> Iterator[None]:
-    """Ctrl-C fills the list instead of raising; a second one raises."""
+    """Ctrl-C, SIGTERM and a terminal that hangs up fill the list instead of ending the process; a
+    second Ctrl-C raises. A hang-up that `nohup` ignores stays ignored."""
+    terminals = [fd for fd in (0, 1, 2) if os.isatty(fd)]
 
     def handle(number_: int, frame: FrameType | None) -> None:
-        if pressed:
+        if number_ == signal.SIGINT and pressed:
             raise KeyboardInterrupt
+        if number_ == HANG_UP:
+            _leave(terminals)
         pressed.append(number_)
 
-    before = signal.signal(signal.SIGINT, handle)
+    heard = [signal.SIGINT, signal.SIGTERM]
+    if HANG_UP is not None and signal.getsignal(HANG_UP) != signal.SIG_IGN:
+        heard.append(HANG_UP)
+    before = {one: signal.signal(one, handle) for one in heard}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for one, handler in before.items():
+            signal.signal(one, handler)
+
+
+def _leave(terminals: list[int]) -> None:
+    """What is still to be said goes nowhere: writing to a terminal that is gone is an error."""
+    with open(os.devnull, "r+b") as nowhere:
+        for descriptor in terminals:
+            os.dup2(nowhere.fileno(), descriptor)
 
 
 def show_result(result: "CampaignResult") -> None:
