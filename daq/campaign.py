@@ -34,6 +34,7 @@ from daq.plan import Condition, Plan
 from daq.runner import IGNITION_S, Runner
 from daq.schedule import Item, Outcome, expand, finished_items
 from daq.store import RunStore
+from daq.store_upkeep import salvage
 from daq.supervise import InterlockRule, Limit, SkipRequested, StopRequested
 from drivers.protocols import DuplexRig, operating_ranges
 
@@ -118,6 +119,7 @@ def run_campaign(
     with Journal(store.campaign_dir(campaign) / "journal.jsonl") as journal:
         store.set_status(campaign, status="running")
         try:
+            salvage(store, campaign)  # what the recording that was cut off holds
             runner = Runner(rig, plan, store, campaign, journal, on_event, control, review)
         except BaseException:
             store.set_status(campaign, status="failed")

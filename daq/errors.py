@@ -5,6 +5,7 @@
     ├── StoreError         the run store cannot be written or read
     │   ├── UnknownItem    no campaign or run of that name (also a KeyError)
     │   └── CorruptFile    a run file is damaged or is not a run file
+    │       └── OtherVersion   it is whole, but of a format that this version does not read
     └── CampaignError      a campaign cannot start or go on
 
 Failures of devices are `drivers.errors.DriverError`. A message names the place, the parameter, its
@@ -35,6 +36,10 @@ class UnknownItem(StoreError, KeyError):
 
 class CorruptFile(StoreError):
     """A run file is damaged, or is not a run file."""
+
+
+class OtherVersion(CorruptFile):
+    """A run file that another version of entrain wrote, in a format that this one does not read."""
 
 
 class CampaignError(DaqError):

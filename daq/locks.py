@@ -2,6 +2,8 @@
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -31,10 +33,18 @@ def try_lock(file: BinaryIO) -> bool:
 
 def is_locked(path: Path) -> bool:
     """Whether another process (or this one) holds the lock on a file; absent: no."""
+    with unless_locked(path) as free:
+        return not free
+
+
+@contextmanager
+def unless_locked(path: Path) -> Iterator[bool]:
+    """Whether nobody holds the lock on a file; it is then held for the block. Absent: nobody."""
     if not path.exists():
-        return False
+        yield True
+        return
     with path.open("ab", buffering=0) as file:
-        return not try_lock(file)
+        yield try_lock(file)
 
 
 def sync_folder(path: Path) -> None:

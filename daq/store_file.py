@@ -31,7 +31,7 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
-from daq.errors import CorruptFile
+from daq.errors import CorruptFile, OtherVersion
 from daq.records import RunHeader, RunSummary
 from drivers.types import Channel, Gap
 
@@ -104,10 +104,14 @@ def write_layout(file: h5py.File, header: RunHeader, campaign: str, version: str
 def read_header(file: h5py.File) -> RunHeader:
     """The header of an open run file; raises `CorruptFile` for anything that is not one."""
     try:
-        if file.attrs.get("format") != FORMAT:
-            raise CorruptFile(
-                f"{file.filename}: format={file.attrs.get('format')!r} is not {FORMAT!r}"
+        found = str(file.attrs.get("format"))
+        if found.startswith("entrain-run/") and found != FORMAT:
+            raise OtherVersion(
+                f"{file.filename}: format={found!r} is of another version of entrain, "
+                f"this one reads {FORMAT!r}: use that one"
             )
+        if found != FORMAT:
+            raise CorruptFile(f"{file.filename}: format={found!r} is not {FORMAT!r}")
         entry = file["entry"].attrs
         samples = file["entry/data/samples"]
         detectors = [dict(group.attrs) for group in file["entry/instrument"].values()]

@@ -2,8 +2,9 @@
 
 `recover` is quick and belongs at every start: it salvages runs whose writer was killed, indexes
 finished files that the catalogue does not know, and marks campaigns that nobody runs any more.
-`verify` reads everything and compares checksums. Nothing is ever deleted because it looks broken:
-what cannot be read goes to `quarantine/`, under a name that tells where it came from.
+`verify` reads everything and compares checksums. Both name what the catalogue or a journal knows
+and the disk has not. Nothing is ever deleted because it looks broken: what cannot be read goes to
+`quarantine/`, under a name that tells where it came from; what another version wrote stays.
 """
 
 import hashlib
@@ -11,19 +12,31 @@ import json
 import os
 import shutil
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from daq.errors import CorruptFile, StoreError
-from daq.locks import is_locked
-from daq.store import RunStore, read_card
+from daq.errors import CorruptFile, OtherVersion, StoreError, UnknownItem
+from daq.journal import read_journal
+from daq.locks import is_locked, unless_locked
+from daq.records import RunSummary
+from daq.store import RunStore, read_card, write_json
 from daq.store_catalogue import RunQuery
 from daq.store_file import open_run, read_header, read_summary
 from daq.store_writer import RunWriter, software_version
 
 SLICE_FRAMES = 1 << 18
-Kind = Literal["salvaged", "indexed", "interrupted", "quarantined", "checksum", "unreadable"]
+Kind = Literal[
+    "salvaged",
+    "indexed",
+    "interrupted",
+    "quarantined",
+    "checksum",
+    "unreadable",
+    "missing",
+    "other version",
+]
 
 
 @dataclass(frozen=True)
@@ -37,34 +50,57 @@ class Finding:
 
 def recover(store: RunStore) -> list[Finding]:
     """Put a store in order after whatever happened; campaigns that are running are left alone."""
-    found: list[Finding] = []
+    found = _missing_campaigns(store)
     for folder in store.folders():
-        if is_locked(folder / "journal.jsonl"):
-            continue
-        try:
-            card = read_card(folder / "campaign.json")
-        except StoreError as error:
-            found.append(Finding("unreadable", folder, str(error)))
-            continue
-        if card.status == "importing":
-            continue  # `import_folder` replaces it when it is asked again
-        for renamed in sorted((folder / "runs").glob(".*.h5.partial.salvaging")):
-            _undo_salvage(renamed)
-        for partial in sorted((folder / "runs").glob(".*.h5.partial")):
-            found.append(_salvage(store, card.id, partial))
-        found += _index(store, card.id, folder / "runs")
-        if card.status == "running":
-            store.set_status(card.id, status="interrupted")
-            found.append(Finding("interrupted", folder, "nobody runs this campaign any more"))
+        with unless_locked(folder / "journal.jsonl") as free:
+            if free:
+                found += _recover_folder(store, folder)
     return found
 
 
-def verify(store: RunStore, campaign: str | None = None) -> list[Finding]:
+def _recover_folder(store: RunStore, folder: Path) -> list[Finding]:
+    try:
+        card = read_card(folder / "campaign.json")
+    except StoreError as error:
+        return [Finding("unreadable", folder, str(error))]
+    if card.status == "importing":
+        return []  # `import_folder` replaces it when it is asked again
+    found = salvage(store, card.id) + _missing_runs(store, card.id)
+    if card.status == "running":
+        store.set_status(card.id, status="interrupted")
+        found.append(Finding("interrupted", folder, "nobody runs this campaign any more"))
+    return found
+
+
+def salvage(store: RunStore, campaign: str) -> list[Finding]:
+    """Keep what a campaign's interrupted recordings hold, and index what the catalogue lacks.
+
+    For whoever holds the campaign's lock.
+    """
+    folder = store.campaign_dir(campaign) / "runs"
+    for renamed in sorted(folder.glob(".*.h5.partial.salvaging")):
+        _undo_salvage(renamed)
+    found = [_salvage(store, campaign, partial) for partial in sorted(folder.glob(".*.h5.partial"))]
+    return found + _index(store, campaign, folder)
+
+
+def verify(
+    store: RunStore,
+    campaign: str | None = None,
+    progress: Callable[[float, str], None] = lambda share, name: None,
+) -> list[Finding]:
     """Read every run file and compare its samples with the checksum of its recording."""
     folders = [store.campaign_dir(campaign)] if campaign else list(store.folders())
-    found: list[Finding] = []
-    for folder in folders:
-        for path in sorted((folder / "runs").glob("*.h5")):
+    found = [] if campaign else _missing_campaigns(store)
+    for number, folder in enumerate(folders):
+        progress(number / len(folders), folder.name)
+        paths = sorted((folder / "runs").glob("*.h5"))
+        try:
+            read_card(folder / "campaign.json")
+        except StoreError as error:
+            if paths or not isinstance(error, UnknownItem):
+                found.append(Finding("unreadable", folder, str(error)))
+        for path in paths:
             try:
                 expected, actual = checksums(path)
             except CorruptFile as error:
@@ -74,7 +110,43 @@ def verify(store: RunStore, campaign: str | None = None) -> list[Finding]:
                 found.append(
                     Finding("checksum", path, f"recorded {expected[:12]}…, file has {actual[:12]}…")
                 )
+        found += _missing_runs(store, folder.name)
     return found
+
+
+def _missing_campaigns(store: RunStore) -> list[Finding]:
+    there = {folder.name for folder in store.folders()}
+    return [
+        Finding("missing", store.campaigns_dir / row.id, "in the catalogue, but its folder is gone")
+        for row in store.campaigns(limit=1_000_000)
+        if row.id not in there
+    ]
+
+
+def _missing_runs(store: RunStore, campaign: str) -> list[Finding]:
+    """Runs that the catalogue or the journal knows and that are neither there nor set aside."""
+    folder = store.campaigns_dir / campaign
+    known = dict.fromkeys(_indexed(store, campaign), "in the catalogue, but its file is gone")
+    found: list[Finding] = []
+    try:
+        lines = read_journal(folder / "journal.jsonl")
+    except CorruptFile as error:
+        lines = []
+        found.append(Finding("unreadable", folder / "journal.jsonl", str(error)))
+    for line in lines:
+        if line["kind"] == "recorded":
+            known.setdefault(line["data"]["run"], "in the journal, but its file is gone")
+    for name, detail in sorted(known.items()):
+        path = folder / "runs" / f"{name}.h5"
+        if not path.exists() and not _set_aside(store, path):
+            found.append(Finding("missing", path, detail))
+    return found
+
+
+def _set_aside(store: RunStore, path: Path) -> bool:
+    """Whether the quarantine has a file from there."""
+    notes = store.quarantine_dir.glob(f"{_quarantine_name(path)}*.json")
+    return any(json.loads(note.read_text("utf-8"))["from"] == str(path) for note in notes)
 
 
 def checksums(path: Path) -> tuple[str, str]:
@@ -93,25 +165,43 @@ def checksums(path: Path) -> tuple[str, str]:
 
 def quarantine(store: RunStore, path: Path, reason: str) -> Finding:
     """Move a damaged file out of its campaign, with a note beside it."""
-    store.quarantine_dir.mkdir(exist_ok=True)
-    stem = f"{path.parent.parent.name}--{path.name.removeprefix('.')}"
+    stem = _quarantine_name(path)
     target, number = store.quarantine_dir / stem, 2
     while target.exists():
         target, number = store.quarantine_dir / f"{stem}.{number}", number + 1
-    os.replace(path, target)
-    note = {"from": str(path), "reason": reason}
-    target.with_name(target.name + ".json").write_text(json.dumps(note, indent=1), "utf-8")
+    try:
+        store.quarantine_dir.mkdir(exist_ok=True)
+        write_json(target.with_name(target.name + ".json"), {"from": str(path), "reason": reason})
+        os.replace(path, target)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be set aside in quarantine ({error})") from error
     return Finding("quarantined", target, reason)
 
 
-def export_campaign(store: RunStore, campaign: str, target: Path) -> Path:
-    """A campaign as one zip: its files as they are, and `manifest.json` with their checksums."""
+def _quarantine_name(path: Path) -> str:
+    return f"{path.parent.parent.name}--{path.name.removeprefix('.')}"
+
+
+@dataclass(frozen=True)
+class Export:
+    """A zip that was written, and what `verify` finds wrong with the campaign in it."""
+
+    path: Path
+    problems: list[str]
+
+
+def export_campaign(store: RunStore, campaign: str, target: Path) -> Export:
+    """A campaign as one zip: its files as they are, and `manifest.json` with their checksums and
+    what `verify` finds wrong with them."""
     folder = store.campaign_dir(campaign)
+    found = verify(store, campaign)
+    problems = [f"{one.kind}: {one.path.name}: {one.detail}" for one in found]
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path.name[0] != ".")
     manifest = {
         "format": "entrain-export/1",
         "campaign": campaign,
         "software_version": software_version(),
+        "problems": problems,
         "files": {
             path.relative_to(folder).as_posix(): {
                 "sha256": _file_sha256(path),
@@ -130,7 +220,7 @@ def export_campaign(store: RunStore, campaign: str, target: Path) -> Path:
     except OSError as error:
         partial.unlink(missing_ok=True)
         raise StoreError(f"{target}: cannot be written ({error})") from error
-    return target
+    return Export(target, problems)
 
 
 def retire(store: RunStore, campaign: str, archive: Path) -> Path:
@@ -138,7 +228,7 @@ def retire(store: RunStore, campaign: str, archive: Path) -> Path:
     folder = store.campaign_dir(campaign)
     if is_locked(folder / "journal.jsonl"):
         raise StoreError(f"campaign {campaign!r} is running; stop it first")
-    made = export_campaign(store, campaign, archive)
+    made = export_campaign(store, campaign, archive).path
     problems = check_export(made)
     if problems:
         raise StoreError(f"{made}: {'; '.join(problems)}; the campaign stays where it is")
@@ -163,27 +253,38 @@ def check_export(archive: Path) -> list[str]:
 
 def _salvage(store: RunStore, campaign: str, partial: Path) -> Finding:
     """The valid frames of a run whose writer died, as a finished file marked ``interrupted``."""
+    target = partial.with_name(partial.name.removeprefix(".").removesuffix(".partial"))
+    if target.exists():
+        return quarantine(store, partial, "a finished run of that name exists")
+    renamed = partial.with_name(partial.name + ".salvaging")
+    os.replace(partial, renamed)
     try:
-        with open_run(partial, live=True) as file:
-            header = read_header(file)
-            samples = file["entry/data/samples"]
-            valid = min(int(file["entry/quality/n_valid"][()]), samples.shape[0])
-            target = partial.with_name(partial.name.removeprefix(".").removesuffix(".partial"))
-            if target.exists():
-                return quarantine(store, partial, "a finished run of that name exists")
-            renamed = partial.with_name(partial.name + ".salvaging")
-            os.replace(partial, renamed)
-            writer = RunWriter(target, header, campaign)
-            for start in range(0, valid, SLICE_FRAMES):
-                stop = min(valid, start + SLICE_FRAMES)
-                writer.append(samples[start:stop], patient=True)
-            detail = f"{valid} frames salvaged after the writer died"
-            summary = writer.finish("interrupted", detail)
+        summary = _copied(renamed, target, campaign)
+    except OtherVersion as error:
+        os.replace(renamed, partial)
+        return Finding("other version", partial, str(error))
     except (CorruptFile, OSError, KeyError, RuntimeError) as error:
+        os.replace(renamed, partial)
         return quarantine(store, partial, f"unreadable after a crash ({error})")
     renamed.unlink()
     store.add_run(summary)
-    return Finding("salvaged", target, detail)
+    return Finding("salvaged", target, summary.exit_reason)
+
+
+def _copied(source: Path, target: Path, campaign: str) -> RunSummary:
+    with open_run(source, live=True) as file:
+        header = read_header(file)
+        samples = file["entry/data/samples"]
+        valid = min(int(file["entry/quality/n_valid"][()]), samples.shape[0])
+        writer = RunWriter(target, header, campaign)
+        try:
+            for start in range(0, valid, SLICE_FRAMES):
+                stop = min(valid, start + SLICE_FRAMES)
+                writer.append(samples[start:stop], patient=True)
+        except BaseException:
+            writer.discard()
+            raise
+        return writer.finish("interrupted", f"{valid} frames salvaged after the writer died")
 
 
 def _undo_salvage(renamed: Path) -> None:
@@ -197,7 +298,7 @@ def _undo_salvage(renamed: Path) -> None:
 
 
 def _index(store: RunStore, campaign: str, folder: Path) -> list[Finding]:
-    known = {run.name for run in store.runs(RunQuery(campaign=campaign), limit=1_000_000)}
+    known = _indexed(store, campaign)
     found: list[Finding] = []
     for path in sorted(folder.glob("*.h5")):
         if path.stem in known:
@@ -205,9 +306,16 @@ def _index(store: RunStore, campaign: str, folder: Path) -> list[Finding]:
         try:
             store.add_run(read_summary(path, campaign))
             found.append(Finding("indexed", path, "finished, but not in the catalogue"))
+        except OtherVersion as error:
+            found.append(Finding("other version", path, str(error)))
         except CorruptFile as error:
             found.append(quarantine(store, path, str(error)))
     return found
+
+
+def _indexed(store: RunStore, campaign: str) -> set[str]:
+    """The names of a campaign's runs in the catalogue."""
+    return {run.name for run in store.runs(RunQuery(campaign=campaign), limit=1_000_000)}
 
 
 def _file_sha256(path: Path) -> str:

@@ -11,7 +11,7 @@ from daq.service.jobs import Link
 from daq.service.unpack import unpack
 from daq.service.words import read_unforced, recording_options
 from daq.store import RunStore
-from daq.store_upkeep import Finding, export_campaign, verify
+from daq.store_upkeep import export_campaign, verify
 from identify.load import load_campaign
 from identify.record import Campaign
 from identify.report import write_html
@@ -135,25 +135,22 @@ def verification(link: Link, store: str, campaign: str | None) -> dict[str, Any]
     """Compare every run, or a campaign's, with the checksum of its recording."""
     target = RunStore(Path(store))
     try:
-        wanted = [campaign] if campaign else [folder.name for folder in target.folders()]
-        findings: list[Finding] = []
-        for index, name in enumerate(wanted):
-            link.progress(index / len(wanted), name)
-            findings += verify(target, name)
+        count = 1 if campaign else sum(1 for _ in target.folders())
+        findings = verify(target, campaign, link.progress)
     finally:
         target.close()
     rows = [
         {"kind": f.kind, "file": f.path.relative_to(target.root).as_posix(), "detail": f.detail}
         for f in findings
     ]
-    return {"campaigns": len(wanted), "findings": rows}
+    return {"campaigns": count, "findings": rows}
 
 
 def export(link: Link, store: str, campaign: str, archive: str) -> dict[str, Any]:
     """Write a campaign as one zip with a manifest of checksums."""
     target = RunStore(Path(store))
     try:
-        path = export_campaign(target, campaign, _place(archive))
+        made = export_campaign(target, campaign, _place(archive))
     finally:
         target.close()
-    return {"campaign": campaign, "bytes": path.stat().st_size}
+    return {"campaign": campaign, "bytes": made.path.stat().st_size, "problems": made.problems}

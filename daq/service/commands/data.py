@@ -216,7 +216,11 @@ def export(
 
     with open_store(store) as source:
         made = export_campaign(source, campaign, target)
-    out.print(f"wrote {made}", markup=False)
+    out.print(f"wrote {made.path}", markup=False)
+    for problem in made.problems:
+        out.print(f"[yellow]not as it should be:[/yellow] {escape(problem)}")
+    if made.problems:
+        raise typer.Exit(1)
 
 
 def _show(findings: "list[Finding]", fine: str) -> None:
