@@ -176,7 +176,9 @@ def test_emergency_stop_reaches_the_rigs_process_and_latches(
     assert answer["was_running"] == ["slow"]
     final = until(client, job["id"], ended)
     result = client.get(f"/jobs/{job['id']}/result").json()
-    assert (final["state"], result["status"]) == ("succeeded", "stopped")
+    assert (final["state"], result["status"]) == ("cancelled", "stopped")
+    assert final["progress"] < 1
+    assert final["error"] == result["reason"]
     assert "emergency stop by local" in result["reason"]
     refused = client.post("/campaigns", json={"rig": "slow", "plan": PLAN})
     assert refused.json()["type"] == "/problems/stopped"
@@ -213,6 +215,8 @@ def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> N
     assert client.post(f"/jobs/{number}/resume", headers=mine).status_code == 202
     until(client, number, lambda seen: seen["hold"] is None)
     until(client, number, lambda _: "free" in event_kinds(server, number))
+    refused = client.delete(f"/jobs/{number}", headers=mine)
+    assert f"POST /api/v1/jobs/{number}/stop" in refused.json()["detail"]
     assert client.post(f"/jobs/{number}/stop", headers=mine).status_code == 202
     until(client, number, ended)
     assert client.get(f"/jobs/{number}/result").json()["status"] == "stopped"
@@ -229,6 +233,25 @@ def test_pause_resume_stop_and_go_on(server: Running, client: httpx.Client) -> N
     good = [run["kind"] for run in detail["runs"] if run["exit_status"] == "success"]
     assert good == ["free", "forced", "forced"]
     client.delete("/rigs/slow/lock", headers=mine)
+
+
+def test_when_its_process_is_killed_what_was_recorded_is_kept(
+    server: Running, client: httpx.Client
+) -> None:
+    plan = {**PLAN, "record_s": 4.0}
+    job = client.post("/campaigns", json={"rig": "slow", "plan": plan}).json()
+    folder = server.service.settings.store_dir / "campaigns" / job["about"]["campaign"] / "runs"
+    until(
+        client, job["id"], lambda _: any(p.stat().st_size > 30_000 for p in folder.glob(".*.h5.*"))
+    )
+    server.service.jobs._running[job["id"]].process.kill()
+    final = until(client, job["id"], ended)
+    assert final["state"] == "failed"
+    assert f"POST /api/v1/campaigns/{folder.parent.name}/resume" in final["error"]
+    detail = client.get(f"/campaigns/{folder.parent.name}").json()
+    assert detail["status"] == "interrupted"
+    assert detail["runs"][-1]["exit_status"] == "interrupted"
+    assert list(folder.glob(".*")) == []
 
 
 def test_sealed_rigs_keep_their_secret_until_asked(client: httpx.Client) -> None:

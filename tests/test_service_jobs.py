@@ -125,3 +125,26 @@ def test_results_outlive_a_restart_and_old_ones_are_forgotten(tmp_path: Path, bu
     assert found is not None
     assert found.result is not None
     assert (found.state, found.result["value"]) == ("succeeded", 6.0)
+
+
+def test_what_a_kill_of_the_service_cut_off_is_known_to_have_failed(
+    tmp_path: Path, bus: Bus, jobs: JobManager
+) -> None:
+    about = {"campaign": "c"}
+    made = [
+        jobs.submit("campaign", "c", f"{WORK}:wait", {}, lane="rig:a", about=about),
+        jobs.submit("campaign", "c", f"{WORK}:wait", {}, lane="rig:a", about=about),
+        jobs.submit("wait", "wait", f"{WORK}:wait", {}),
+    ]
+    until(lambda job: job.message == "waiting", made[2])
+    jobs.cancel(made[2].id)
+    until(ended, made[2])
+    again = JobManager(tmp_path / "jobs", bus)  # as if the first manager's process were killed
+    running, queued, cancelled = (again.get(job.id) for job in made)
+    assert running is not None
+    assert queued is not None
+    assert cancelled is not None
+    assert (running.state, queued.state, cancelled.state) == ("failed", "failed", "cancelled")
+    assert running.error is not None
+    assert "POST /api/v1/campaigns/c/resume" in running.error
+    assert running.finished is not None

@@ -7,8 +7,9 @@ campaign.
 
 The work is a function ``work(link, **arguments) -> dict``, named as ``"module:function"``. Through
 `Link` it reports progress, log lines and events, and hears commands (``pause``, ``stop``).
-Finished jobs are kept as JSON files, so that results outlive a restart; a result stays there and
-is read when somebody asks, so that a service that has made hundreds is no larger for it.
+Jobs are kept as JSON files from the start, so that results outlive a restart, and what a kill of
+the service cut off is known to have failed. A result stays there and is read when somebody asks, so
+that a service that has made hundreds is no larger for it.
 """
 
 import contextlib
@@ -46,7 +47,11 @@ log = logging.getLogger("entrain.jobs")
 
 
 class Cancelled(Exception):
-    """Raised by work that gives up because it was told to."""
+    """Raised by work that gives up because it was told to; `result`: what it came to by then."""
+
+    def __init__(self, reason: str, result: dict[str, Any] | None = None) -> None:
+        super().__init__(reason)
+        self.result = result
 
 
 class Link:
@@ -138,7 +143,7 @@ def _process(pipe: Connection, target: str, arguments: dict[str, Any], analysis:
         work = getattr(importlib.import_module(module), name)
         link._send("done", plain(work(link, **arguments)))
     except Cancelled as error:
-        link._send("cancelled", str(error))
+        link._send("cancelled", str(error), plain(error.result))
     except Exception as error:
         link._send("failed", f"{type(error).__name__}: {error}", traceback.format_exc())
 
@@ -170,14 +175,23 @@ class Job:
     @property
     def result(self) -> dict[str, Any] | None:
         """What the work returned; None before it has, and where it did not."""
-        if self.file is None or self.state != "succeeded":
+        if self.file is None:
             return self.outcome
         try:
-            kept: dict[str, Any] = json.loads(self.file.read_text(encoding="utf-8"))["result"]
+            kept: dict[str, Any] | None = json.loads(self.file.read_text(encoding="utf-8"))[
+                "result"
+            ]
         except (OSError, ValueError, KeyError):
             log.exception("the result of job %s cannot be read", self.id)
             return None
         return kept
+
+    @property
+    def remedy(self) -> str:
+        """What to do where its process broke off."""
+        if self.kind == "campaign":
+            return f"POST /api/v1/campaigns/{self.about['campaign']}/resume goes on with it"
+        return "start it again"
 
     def summary(self) -> dict[str, Any]:
         """What lists and events show: all but log, result and arguments."""
@@ -213,8 +227,8 @@ class JobManager:
         self._listeners: list[Callable[[Job], None]] = []
         self._load()
 
-    def when_finished(self, listener: Callable[[Job], None]) -> None:
-        """Call `listener` with every job that ends."""
+    def when_failed(self, listener: Callable[[Job], None]) -> None:
+        """Call `listener` with every job that fails, before that is told."""
         self._listeners.append(listener)
 
     def submit(
@@ -237,6 +251,7 @@ class JobManager:
             job = Job(name, kind, title, lane, owner, target, arguments, about or {})
             job.created = self._now()
             self._jobs[job.id] = job
+            self._keep_file(job)
             self._tell(job)
             self._dispatch()
             return job
@@ -314,6 +329,7 @@ class JobManager:
                 busy = sum(one.job.lane == job.lane for one in self._running.values())
                 if busy < (self._workers if job.lane == "analysis" else 1):
                     job.state, job.started = "running", self._now()
+                    self._keep_file(job)
                     self._running[job.id] = _Running(self, job, self._timeout_s)
                     self._tell(job)
 
@@ -328,22 +344,21 @@ class JobManager:
         result: dict[str, Any] | None = None,
         error: str | None = None,
     ) -> None:
-        with self._lock:
-            job.finished, job.outcome, job.error, job.hold = self._now(), result, error, None
-            if state == "succeeded":
-                job.progress = 1.0
-            self._running.pop(job.id, None)
-            try:
-                job.file, job.outcome = self._save(job), None
-            except OSError:  # a full disk: the job is over all the same
-                log.exception("job %s cannot be kept", job.id)
-            job.state = state
-            self._forget()
-        for listener in self._listeners:
+        for listener in self._listeners if state == "failed" else ():
             try:
                 listener(job)
             except Exception:
                 log.exception("a listener failed for job %s", job.id)
+        with self._lock:
+            self._running.pop(job.id, None)
+            job.finished, job.outcome, job.error, job.hold = self._now(), result, error, None
+            if state == "succeeded":
+                job.progress = 1.0
+            job.file = self._keep_file(job, state)
+            if job.file is not None:
+                job.outcome = None
+            job.state = state
+            self._forget()
         self._tell(job)
         self._dispatch()
 
@@ -355,16 +370,20 @@ class JobManager:
             del self._jobs[job.id]
             (self._folder / f"{job.id}.json").unlink(missing_ok=True)
 
-    def _save(self, job: Job) -> Path:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        result = job.outcome
-        state = "succeeded" if result is not None else ("failed" if job.error else "cancelled")
-        body = {**asdict(job), "state": state, "log": list(job.log), "result": result}
+    def _keep_file(self, job: Job, state: State | None = None) -> Path | None:
+        """Write the job down; None where that fails."""
+        body = {**asdict(job), "log": list(job.log), "result": job.outcome}
+        body["state"] = state or job.state
         del body["outcome"], body["file"]
         temporary = self._folder / f".{job.id}.tmp"
-        temporary.write_text(json.dumps(body, default=str), encoding="utf-8")
         path = self._folder / f"{job.id}.json"
-        os.replace(temporary, path)
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            temporary.write_text(json.dumps(body, default=str), encoding="utf-8")
+            os.replace(temporary, path)
+        except OSError:  # a full disk: the job goes on, or is over, all the same
+            log.exception("job %s cannot be kept", job.id)
+            return None
         return path
 
     def _load(self) -> None:
@@ -382,6 +401,10 @@ class JobManager:
                 log.warning("a job file without the usual keys is left out")
                 continue
             self._jobs[job.id] = job
+            if job.state not in FINISHED:
+                job.error = f"the service ended before this job did: {job.remedy}"
+                job.state, job.finished, job.hold = "failed", self._now(), None
+                self._keep_file(job)
 
 
 class _Running:
@@ -472,15 +495,16 @@ class _Running:
                 log.error("job %s failed: %s\n%s", job.id, body[0], body[1])
                 return "failed", {"error": body[0].replace(self._manager.hide, "")}
             if kind == "cancelled":
-                return "cancelled", {"error": body[0] or "cancelled"}
+                return "cancelled", {"error": body[0] or "cancelled", "result": body[1]}
             self._heard(kind, body)
         if self.cancelled:
             return "cancelled", {"error": "cancelled"}
         self.process.join()
-        reason = (
-            job.message if "jobs.timeout_s" in job.message else "its process ended unexpectedly"
-        )
-        return "failed", {"error": f"{reason} (exit code {self.process.exitcode})"}
+        code = self.process.exitcode
+        if "jobs.timeout_s" in job.message:
+            return "failed", {"error": f"{job.message} (exit code {code})"}
+        reason = f"its process ended unexpectedly (exit code {code})"
+        return "failed", {"error": f"{reason}: {job.remedy}"}
 
     def _heard(self, kind: str, body: Iterable[Any]) -> None:
         job, bus = self.job, self._manager._bus

@@ -23,7 +23,7 @@ from daq.campaign import (
     run_campaign,
 )
 from daq.plan import Plan, parse_plan
-from daq.service.jobs import Link
+from daq.service.jobs import Cancelled, Link
 from daq.service.laid import laid_over, noted, over
 from daq.service.observed import observe
 from daq.service.rigs import RigEntry, open_rig
@@ -112,7 +112,8 @@ def campaign(
     campaign_id: str = "",
     resume: bool = False,
 ) -> dict[str, Any]:
-    """Run (or go on with) a campaign on `rig`; returns what it came to."""
+    """Run (or go on with) a campaign on `rig`; returns what it came to, raises where it was
+    stopped."""
     runs = RunStore(Path(store))
     with contextlib.closing(runs):
         wanted = _plan(plan, runs, campaign_id if resume else None, link.progress)
@@ -133,7 +134,9 @@ def campaign(
                 campaign_id="" if resume else campaign_id,
                 notes=noted(laid),
             )
-        return summary(result)
+    if result.status == "stopped":
+        raise Cancelled(result.reason, summary(result))
+    return summary(result)
 
 
 def reviewer_of(plan: Plan) -> Reviewer | None:

@@ -75,7 +75,7 @@ async def job_log(job: str, service: Parts, who: Reader) -> list[str]:
 
 @router.get("/jobs/{job}/result")
 def job_result(job: str, service: Parts, who: Reader) -> dict[str, Any]:
-    """What the job returned; 409 until it has succeeded."""
+    """What the job returned, or a campaign came to that was stopped; 409 where there is nothing."""
     found = find(service, job)
     result = found.result  # read from its file
     if result is None:
@@ -86,10 +86,10 @@ def job_result(job: str, service: Parts, who: Reader) -> dict[str, Any]:
 
 @router.delete("/jobs/{job}", status_code=202)
 def cancel(job: str, service: Parts, who: Controller) -> JobSummary:
-    """End an analysis that waits or runs. A campaign is ended by its own `stop`."""
+    """End an analysis that waits or runs. What runs on a rig ends by `POST /jobs/{job}/stop`."""
     found = find(service, job)
     if found.lane != "analysis" and found.state == "running":
-        raise Problem(409, "use-stop", "a running campaign ends by POST .../campaigns/{id}/stop")
+        raise Problem(409, "use-stop", f"what runs on a rig ends by POST /api/v1/jobs/{job}/stop")
     service.audit.record(who.name, "cancel", job)
     service.jobs.cancel(job)
     return shown(found)
