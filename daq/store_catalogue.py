@@ -6,10 +6,11 @@ found by key (`after` is the last id of the page before), never by offset, so a 
 at run 10 and at run 100 000.
 """
 
+import shutil
 import sqlite3
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import astuple, dataclass, fields
 from operator import attrgetter
 from pathlib import Path
@@ -19,6 +20,7 @@ from daq.errors import StoreError
 from daq.records import RunSummary
 
 SCHEMA_VERSION = 1
+NEEDED_BYTES = 2**17  # for SQLite's log and its shared memory
 _COLUMNS = tuple(field.name for field in fields(RunSummary))
 _values = attrgetter(*_COLUMNS)  # astuple copies deeply, ten times slower
 _SCHEMA = f"""
@@ -186,9 +188,15 @@ class Catalogue:
             if connection.execute("PRAGMA user_version").fetchone()[0] != SCHEMA_VERSION:
                 connection.executescript(_SCHEMA)
         except (sqlite3.Error, OSError) as error:
+            remedy = (
+                "it holds nothing that the run files do not: remove it and run "
+                "`entrain store rebuild`"
+            )
+            with suppress(OSError):
+                if shutil.disk_usage(self.path.parent).free < NEEDED_BYTES:
+                    remedy = "the disk is full: make room"
             raise StoreError(
-                f"{self.path}: the catalogue cannot be opened ({error}); it holds nothing "
-                "that the run files do not: remove it and run `entrain store rebuild`"
+                f"{self.path}: the catalogue cannot be opened ({error}); {remedy}"
             ) from error
         return connection
 

@@ -1,5 +1,6 @@
 """The service over a real socket: who may do what, what is refused, and how it says so."""
 
+import contextlib
 import json
 import os
 import re
@@ -7,10 +8,11 @@ import signal
 import socket
 import ssl
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import httpx
@@ -23,7 +25,9 @@ from websockets.typing import Origin
 from daq.service.keys import KeyStore
 from daq.service.server import make_server
 from daq.service.settings import ConfigError, ServerSettings, Settings
+from daq.store import RunStore
 from tests.service_live import Running, running
+from tests.small_disk import small_disk
 
 
 @pytest.fixture(scope="module")
@@ -398,3 +402,65 @@ def test_broken_requests_get_a_4xx_or_nothing(open_server: Running, raw: bytes) 
         except ConnectionResetError:
             answer = b""
     assert not answer or answer.split()[1].startswith(b"4")
+
+
+@contextmanager
+def process(data_dir: Path) -> Iterator[subprocess.Popen[str]]:
+    """`entrain serve` in a session of its own."""
+    child = subprocess.Popen(
+        [sys.executable, "-m", "daq.cli", "serve", "--port", "0"],
+        cwd=Path(__file__).parent.parent,
+        env={**os.environ, "ENTRAIN_DATA_DIR": str(data_dir), "XDG_CONFIG_HOME": str(data_dir)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield child
+    finally:
+        child.kill()
+        child.communicate()
+
+
+def address(child: subprocess.Popen[str]) -> str:
+    assert child.stdout is not None
+    found = re.search(r"http://\S+", child.stdout.readline())
+    assert found is not None, child.communicate()
+    return found[0]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads the processes of a session")
+def test_nothing_outlives_a_killed_service_and_one_service_has_the_data(tmp_path: Path) -> None:
+    with process(tmp_path) as child:
+        url = address(child)
+        with process(tmp_path) as second:
+            said = second.communicate(timeout=60)[1]
+            assert second.returncode == 2
+            assert f"data_dir={str(tmp_path)!r} is served by another process" in said
+            assert said.count("\n") == 1
+        facts = httpx.get(f"{url}/api/v1/rigs/simulated/facts", timeout=60, trust_env=False)
+        assert facts.status_code == 200
+        child.kill()
+        child.wait()
+        end = time.monotonic() + 20
+        while (
+            subprocess.run(["ps", "-s", str(child.pid)], stdout=subprocess.DEVNULL).returncode == 0
+        ):
+            assert time.monotonic() < end, "something of the service is left"
+            time.sleep(0.05)
+    with process(tmp_path) as third:  # the lock is gone with its process
+        address(third)
+
+
+def test_a_full_disk_is_one_clear_error(tmp_path: Path) -> None:
+    with small_disk(tmp_path / "disk") as place:
+        RunStore(place / "store").close()
+        with (place / "filler").open("wb", buffering=0) as filler, contextlib.suppress(OSError):
+            while True:
+                filler.write(bytes(4096))
+        with process(place) as child:
+            out, err = child.communicate(timeout=60)
+        assert (child.returncode, out) == (1, "")
+        assert err.count("\n") == 1
+        assert "the disk is full: make room" in err

@@ -1,6 +1,5 @@
 """Crashes, full disks, damaged files: what is left, and that it is said."""
 
-import contextlib
 import json
 import os
 import shutil
@@ -9,7 +8,6 @@ import subprocess
 import sys
 import textwrap
 import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -37,6 +35,7 @@ from daq.store_upkeep import (
 from daq.store_writer import partial_path
 from simulated_rig.build import build_rig
 from tests.daq_folders import write_folder
+from tests.small_disk import small_disk
 
 ROOT = Path(__file__).parent.parent
 
@@ -130,19 +129,6 @@ def assert_recorded(path: Path) -> None:
         samples = file["entry/data/samples"][()]
     assert len(samples) >= 1000
     assert np.all(np.any(samples != 0, axis=1))
-
-
-@contextlib.contextmanager
-def small_disk(place: Path) -> Iterator[Path]:
-    """A file system of 2.5 MB."""
-    place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=2500k", "none", str(place)]
-    if subprocess.run(command, capture_output=True, check=False).returncode != 0:
-        pytest.skip("no file system can be mounted here (it takes root)")
-    try:
-        yield place
-    finally:
-        subprocess.run(["umount", "-l", str(place)], check=True)
 
 
 def test_a_recording_leaves_room_to_say_that_the_disk_is_full(tmp_path: Path) -> None:

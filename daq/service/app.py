@@ -5,6 +5,7 @@ import logging
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -35,6 +36,7 @@ from daq.service import (
 )
 from daq.service.asked import only_asked
 from daq.service.guard import Guard
+from daq.service.jobs import Job
 from daq.service.settings import Settings
 from daq.service.state import Service, build
 
@@ -67,9 +69,15 @@ ROUTERS: tuple[APIRouter, ...] = (
 
 
 def recover(service: Service) -> None:
-    """Put the store in order after whatever ended the service's last life."""
+    """Put the store in order after whatever ended the service's last life, or a rig's process."""
     for finding in store_upkeep.recover(service.store):
         log.warning("%s: %s: %s", finding.kind, finding.path, finding.detail)
+
+
+def recover_after(service: Service, job: Job) -> None:
+    """Put the store in order after a job on a rig that failed."""
+    if job.lane != "analysis":
+        recover(service)
 
 
 def create_api(service: Service) -> FastAPI:
@@ -80,7 +88,6 @@ def create_api(service: Service) -> FastAPI:
         service.bus.attach(asyncio.get_running_loop())
         sys.setswitchinterval(SWITCH_S)
         processes.warm()
-        await asyncio.to_thread(recover, service)
         yield
         service.closing = True
         service.bus.detach()
@@ -112,5 +119,6 @@ def create_api(service: Service) -> FastAPI:
 def create_app(settings: Settings) -> tuple[ASGIApp, Service]:
     """What uvicorn serves, and the service inside it."""
     service = build(settings)
+    service.jobs.when_failed(partial(recover_after, service))
     api = create_api(service)
     return Guard(api, settings, service.keys, service.tickets, service.metrics), service

@@ -9,6 +9,7 @@ up a request: an emergency stop has to get through.
 """
 
 import multiprocessing
+import os
 import signal
 import threading
 from collections.abc import Callable
@@ -38,6 +39,22 @@ def warm() -> None:
             forkserver.ensure_running()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_service() -> None:
+    """Make this process end when the service is killed.
+
+    It holds both ends of the pipe on which it waits for questions, so it would wait for ever, and
+    the server process that it was forked from with it.
+    """
+    service = multiprocessing.parent_process()
+    assert service is not None
+
+    def wait() -> None:
+        service.join()
+        os._exit(1)
+
+    threading.Thread(target=wait, daemon=True, name="service").start()
 
 
 class Aside:
@@ -83,5 +100,7 @@ class Aside:
     def _executor(self) -> ProcessPoolExecutor:
         with self._lock:
             if self._pool is None:
-                self._pool = ProcessPoolExecutor(1, mp_context=context)
+                self._pool = ProcessPoolExecutor(
+                    1, mp_context=context, initializer=_end_with_service
+                )
             return self._pool

@@ -3,12 +3,14 @@
 import logging
 import socket
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 import uvicorn
 
-from daq.service.app import create_app
+from daq.locks import try_lock
+from daq.service.app import create_app, recover
 from daq.service.settings import ConfigError, Settings
 from daq.service.state import Service
 
@@ -44,9 +46,10 @@ def check(settings: Settings, service: Service) -> None:
 
 
 def make_server(settings: Settings) -> Server:
-    """A server, ready to run; raises `ConfigError` where it must not listen."""
+    """A server, ready to run, its store in order; raises `ConfigError` where it must not listen."""
     app, service = create_app(settings)
     check(settings, service)
+    recover(service)
     tls = settings.server.tls_certificate, settings.server.tls_key
     config = uvicorn.Config(
         app,
@@ -89,12 +92,39 @@ def listen(host: str, port: int) -> socket.socket:
     return sock
 
 
+@contextmanager
+def alone(settings: Settings) -> Iterator[None]:
+    """Hold the data directory: an emergency stop reaches only the rigs of the service asked.
+
+    Raises `ConfigError` where another service holds it. The lock dies with the process.
+    """
+    place = settings.data_dir
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+        file = (place / "service.lock").open("ab")
+    except OSError as error:
+        raise ConfigError(
+            f"data_dir={str(place)!r} cannot be written ({error.strerror})"
+        ) from error
+    with file:
+        if not try_lock(file):
+            raise ConfigError(
+                f"data_dir={str(place)!r} is served by another process: "
+                "stop that one, or give this one a data_dir of its own"
+            )
+        yield
+
+
 def serve(settings: Settings, ready: Callable[[str], None] | None = None) -> None:
     """Listen until a signal; `ready` is told the address.
 
-    Raises `ConfigError` where the address cannot be bound.
+    Raises `ConfigError` where the address cannot be bound, or the data are another service's.
     """
-    server = make_server(settings)
+    with alone(settings):
+        _serve(make_server(settings), settings, ready)
+
+
+def _serve(server: Server, settings: Settings, ready: Callable[[str], None] | None) -> None:
     host = settings.server.host
     sock = listen(host, settings.server.port)
     scheme = "https" if settings.server.tls_certificate else "http"
