@@ -4,6 +4,7 @@ Exit codes: 0 done, 1 the work failed, 2 what was asked is not possible as asked
 line on standard error; ``--debug`` shows the trace instead.
 """
 
+import errno
 import sys
 from io import TextIOWrapper
 from pathlib import Path
@@ -99,6 +100,8 @@ def main(arguments: list[str] | None = None) -> None:
         if "--debug" in words:
             raise
         text = " ".join(str(error).split()) or type(error).__name__
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            text += ": the disk is full, make room"
         prefix = "" if isinstance(error, expected()) else f"unforeseen {type(error).__name__}: "
         sys.stderr.write(f"entrain: {prefix}{text}\n")
         sys.exit(2 if isinstance(error, bad_input()) else 1)

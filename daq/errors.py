@@ -12,6 +12,8 @@ Failures of devices are `drivers.errors.DriverError`. A message names the place,
 value and the requirement, then the remedy.
 """
 
+import errno
+from pathlib import Path
 from typing import Any
 
 
@@ -50,3 +52,9 @@ def told(value: Any) -> str:
     """``=value`` of a number or a short text, for an error's sentence; of anything else nothing."""
     short = isinstance(value, str) and len(value) <= 60
     return f"={value!r}" if short or isinstance(value, (bool, int, float)) else ""
+
+
+def unwritable(path: Path, error: OSError) -> StoreError:
+    """What to raise where a file cannot be written: which, why, and the remedy that there is."""
+    remedy = ": the disk is full, make room" if error.errno == errno.ENOSPC else ""
+    return StoreError(f"{path}: cannot be written ({error.strerror or error}){remedy}")

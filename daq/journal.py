@@ -13,7 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from daq.errors import CorruptFile, StoreError
+from daq.errors import CorruptFile, StoreError, unwritable
 from daq.locks import try_lock
 from daq.store import utc_now
 
@@ -49,7 +49,7 @@ class Journal:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise StoreError(f"{self.path}: cannot be written ({error})") from error
+            raise unwritable(self.path, error) from error
         self._seq += 1
 
     def close(self) -> None:

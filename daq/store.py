@@ -21,7 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from daq.errors import CorruptFile, StoreError, UnknownItem
+from daq.errors import CorruptFile, StoreError, UnknownItem, unwritable
 from daq.records import CampaignCard, RunHeader, RunSummary
 from daq.store_catalogue import CampaignRow, Catalogue, RunQuery
 from daq.store_file import read_summary
@@ -84,7 +84,7 @@ class RunStore:
             folder = self._named(stem) if id else self._unnamed(stem)
             (folder / "runs").mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise StoreError(f"{self.root}: cannot be written ({error})") from error
+            raise unwritable(self.root, error) from error
         for name, content in (documents or {}).items():
             write_json(folder / name, content)
         made = CampaignCard(id=folder.name, title=title, created_at=created_at, **card)
@@ -231,7 +231,8 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
             os.fsync(file.fileno())
         os.replace(partial, path)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be written ({error})") from error
+        partial.unlink(missing_ok=True)
+        raise unwritable(path, error) from error
 
 
 def _row(card: CampaignCard) -> CampaignRow:

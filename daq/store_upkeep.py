@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from daq.errors import CorruptFile, OtherVersion, StoreError, UnknownItem
+from daq.errors import CorruptFile, OtherVersion, StoreError, UnknownItem, unwritable
 from daq.journal import read_journal
 from daq.locks import is_locked, unless_locked
 from daq.records import RunSummary
@@ -174,7 +174,7 @@ def quarantine(store: RunStore, path: Path, reason: str) -> Finding:
         write_json(target.with_name(target.name + ".json"), {"from": str(path), "reason": reason})
         os.replace(path, target)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be set aside in quarantine ({error})") from error
+        raise unwritable(target, error) from error
     return Finding("quarantined", target, reason)
 
 
@@ -219,7 +219,7 @@ def export_campaign(store: RunStore, campaign: str, target: Path) -> Export:
         os.replace(partial, target)
     except OSError as error:
         partial.unlink(missing_ok=True)
-        raise StoreError(f"{target}: cannot be written ({error})") from error
+        raise unwritable(target, error) from error
     return Export(target, problems)
 
 

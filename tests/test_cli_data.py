@@ -11,8 +11,10 @@ from typing import cast
 import pytest
 
 from daq.service.commands.analysis import show_quality
+from daq.store import RunStore
 from identify.results import Diagnosis, QualityFlag
 from tests.service_data import make_folder
+from tests.small_disk import fill, small_disk
 
 
 @pytest.fixture
@@ -174,6 +176,31 @@ def test_keys_are_shown_once_and_can_be_revoked(
     assert text.strip() not in out
     assert entrain(capfd, "keys", "revoke", identifier)[0] == 0
     assert "revoked" in entrain(capfd, "keys", "list")[1]
+
+
+def test_on_a_full_disk_the_file_and_the_remedy_are_named(
+    home: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with small_disk(home / "disk") as place:
+        monkeypatch.setenv("ENTRAIN_DATA_DIR", str(place))
+        store = RunStore(place / "store")
+        torn = store.campaign_dir(store.create_campaign("torn").id) / "runs" / "000-free.h5"
+        torn.write_bytes(b"nothing of use")
+        fill(place)
+        before = set(place.iterdir())
+        store.close()
+        for words, file in (
+            (("keys", "create", "ann"), "keys.json"),
+            (("effects", "--json", place / "effects.json"), "effects.json"),
+            (("store", "recover"), "000-free.h5"),
+        ):
+            code, _, err = entrain(capfd, *words)
+            assert code == 1
+            assert err.count("\n") == 1
+            assert file in err
+            assert "make room" in err
+        assert {path.name for path in set(place.iterdir()) - before} <= {"quarantine"}
+        assert torn.exists()
 
 
 def test_config_show_says_where_from(

@@ -1,6 +1,5 @@
 """The service over a real socket: who may do what, what is refused, and how it says so."""
 
-import contextlib
 import json
 import os
 import re
@@ -27,7 +26,7 @@ from daq.service.server import make_server
 from daq.service.settings import ConfigError, ServerSettings, Settings
 from daq.store import RunStore
 from tests.service_live import Running, running
-from tests.small_disk import small_disk
+from tests.small_disk import fill, small_disk
 
 
 @pytest.fixture(scope="module")
@@ -456,9 +455,7 @@ def test_nothing_outlives_a_killed_service_and_one_service_has_the_data(tmp_path
 def test_a_full_disk_is_one_clear_error(tmp_path: Path) -> None:
     with small_disk(tmp_path / "disk") as place:
         RunStore(place / "store").close()
-        with (place / "filler").open("wb", buffering=0) as filler, contextlib.suppress(OSError):
-            while True:
-                filler.write(bytes(4096))
+        fill(place)
         with process(place) as child:
             out, err = child.communicate(timeout=60)
         assert (child.returncode, out) == (1, "")

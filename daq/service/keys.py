@@ -22,6 +22,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal, cast, get_args
 
+from daq.errors import unwritable
+
 Scope = Literal["read", "control", "configure", "admin"]
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 
@@ -165,10 +167,17 @@ class KeyStore:
         self._stamp = stamp
 
     def _write(self) -> None:
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=self._path.parent)  # readable by the owner only
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump([asdict(key) for key in self._keys.values()], file, indent=1)
-        os.replace(name, self._path)
+        name: str | None = None
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            # readable by the owner only
+            handle, name = tempfile.mkstemp(dir=self._path.parent, prefix=".keys.")
+            with os.fdopen(handle, "w", encoding="utf-8") as file:
+                json.dump([asdict(key) for key in self._keys.values()], file, indent=1)
+            os.replace(name, self._path)
+        except OSError as error:
+            if name is not None:
+                Path(name).unlink(missing_ok=True)
+            raise unwritable(self._path, error) from error
         status = self._path.stat()
         self._stamp = (status.st_mtime_ns, status.st_size)

@@ -141,6 +141,7 @@ def number(value: float | None, digits: int = 4) -> str:
 def write_json(place: Path | None, content: dict[str, Any]) -> None:
     """Write `content` to `place`, or to stdout for ``-``; nothing for None. What is no finite
     number is null."""
+    from daq.errors import unwritable
     from daq.service.plain import plain
 
     if place is None:
@@ -150,5 +151,10 @@ def write_json(place: Path | None, content: dict[str, Any]) -> None:
     text = json.dumps(plain(content), indent=2, ensure_ascii=ascii_, allow_nan=False)
     if to_terminal:
         sys.stdout.write(text + "\n")
-    else:
+        return
+    try:
         place.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        if place.is_file():
+            place.unlink()  # a part of the answer is none
+        raise unwritable(place, error) from error
