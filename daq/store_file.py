@@ -104,8 +104,8 @@ def write_layout(file: h5py.File, header: RunHeader, campaign: str, version: str
 def read_header(file: h5py.File) -> RunHeader:
     """The header of an open run file; raises `CorruptFile` for anything that is not one."""
     try:
-        found = str(file.attrs.get("format"))
-        if found.startswith("entrain-run/") and found != FORMAT:
+        found = file.attrs.get("format")
+        if str(found).startswith("entrain-run/") and found != FORMAT:
             raise OtherVersion(
                 f"{file.filename}: format={found!r} is of another version of entrain, "
                 f"this one reads {FORMAT!r}: use that one"

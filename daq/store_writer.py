@@ -29,12 +29,13 @@ import numpy.typing as npt
 from daq.errors import StoreError
 from daq.locks import sync_folder
 from daq.records import ExitStatus, RunHeader, RunSummary
-from daq.store_file import FLAG_BITS, summarise, write_layout
+from daq.store_file import CHUNK_FRAMES, FLAG_BITS, summarise, write_layout
 from drivers.types import Flag
 
 MAX_QUEUED_BYTES = 256 * 2**20  # some 150 s of 8 channels at 51.2 kHz float32
 DISK_ERRORS = (OSError, RuntimeError)  # HDF5 raises either where a disk is full
 MAX_FILLED_GAP_S = 60.0
+METADATA_BYTES = 2**16  # more than HDF5 needs to say where one batch lies
 SPARE_BYTES = 2**20  # left free on the disk: for HDF5's own, and for saying how the campaign ended
 
 
@@ -242,7 +243,8 @@ class RunWriter:
             self.finish("failed", f"{type(error).__name__}: {error}")
         else:
             self._stop_thread()
-            self._let_go()
+            if self._error is None:
+                self._let_go()
 
     def _expected(self, first: int = 0) -> int:
         return first if self._next_frame is None else self._next_frame
@@ -266,7 +268,7 @@ class RunWriter:
             ended = False
             while not ended:
                 batch, ended = self._collect()
-                self._require_room(batch)
+                self._reserve(batch)
                 for piece in batch:
                     origin = piece.first_frame if origin is None else origin
                     self._write(piece, piece.first_frame - origin)
@@ -283,18 +285,26 @@ class RunWriter:
     def _let_go(self) -> None:
         """Close a file that cannot be written, and leave it on the disk as a kill would.
 
-        What HDF5 still has in hand goes nowhere: a close that fails spoils the file, and ends the
-        process later (a segmentation fault).
+        Once at most. What HDF5 still has in hand goes nowhere: a close that fails spoils the file,
+        and ends the process later (a segmentation fault).
         """
         with contextlib.suppress(*DISK_ERRORS), open(os.devnull, "r+b") as nowhere:
             os.dup2(nowhere.fileno(), self._file.id.get_vfd_handle())
         with contextlib.suppress(*DISK_ERRORS):
             self._file.close()
 
-    def _require_room(self, batch: Sequence[_Piece] = ()) -> None:
-        wanted = SPARE_BYTES + sum(piece.samples.nbytes for piece in batch)
-        if (free := shutil.disk_usage(self.path.parent).free) < wanted:
+    def _require_room(self) -> None:
+        if (free := shutil.disk_usage(self.path.parent).free) < SPARE_BYTES:
             raise OSError(f"the disk is full, {free / 2**20:.1f} MiB are left: make room")
+
+    def _reserve(self, batch: Sequence[_Piece]) -> None:
+        """Have the disk's word for what a batch takes: HDF5 does not survive a write that fails."""
+        self._require_room()
+        if hasattr(os, "posix_fallocate"):
+            wanted = sum(piece.samples.nbytes for piece in batch)
+            wanted += 2 * CHUNK_FRAMES * len(self.header.channels) * self._dtype.itemsize
+            end = self._file.id.get_filesize()
+            os.posix_fallocate(self._file.id.get_vfd_handle(), end, wanted + METADATA_BYTES)
 
     def _collect(self) -> tuple[list[_Piece], bool]:
         """Wait for a piece, then take what else is there, up to one flush interval's worth."""
@@ -335,7 +345,7 @@ class RunWriter:
 def _reason(error: BaseException) -> str:
     """Why in a few words: HDF5 says it in ten lines, the system's own words among them."""
     found = re.search(r"error message = '([^']*)'", str(error))
-    return found[1] if found else str(error)
+    return found[1] if found else str(getattr(error, "strerror", None) or error)
 
 
 def _append_row(dataset: h5py.Dataset, row: tuple[int, ...]) -> None:

@@ -10,9 +10,9 @@ import pytest
 
 @contextmanager
 def small_disk(place: Path) -> Iterator[Path]:
-    """A file system of 2.5 MB."""
+    """A file system of 3.2 MB."""
     place.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=2500k", "none", str(place)]
+    command = ["mount", "-t", "tmpfs", "-o", "size=3200k", "none", str(place)]
     if subprocess.run(command, capture_output=True, check=False).returncode != 0:
         pytest.skip("no file system can be mounted here (it takes root)")
     try:

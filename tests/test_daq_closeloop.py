@@ -16,7 +16,7 @@ from daq.errors import InputError
 from daq.plan import Condition, Plan, parse_plan, read_plan
 from daq.records import Kind, RunSummary
 from daq.service import loop_work, rig_work
-from daq.service.jobs import Link
+from daq.service.jobs import Cancelled, Link
 from daq.service.laid import noted
 from daq.service.loop_work import RigSteps, turn
 from daq.service.rigs import SIMULATED, RigEntry, open_simulated
@@ -254,8 +254,10 @@ def test_a_campaign_as_a_job_goes_on_with_the_options_that_it_began_with(
     ours, theirs = Pipe()
     with ours, theirs:
         tube = asdict(RigEntry("tube", SIMULATED, {"noise_db": 60.0}))
-        found = rig_work.campaign(Link(theirs), tube, str(store.root), {}, "one", resume=True)
-    assert found["status"] == "stopped"
+        with pytest.raises(Cancelled) as stopped:
+            rig_work.campaign(Link(theirs), tube, str(store.root), {}, "one", resume=True)
+    assert stopped.value.result is not None
+    assert stopped.value.result["status"] == "stopped"
     assert [entry.options for entry in opened] == [{"noise_db": 60.0, "seed": 5}]
 
 

@@ -115,7 +115,7 @@ FULL = """
     store = RunStore(sys.argv[1])
     plan = Plan(conditions=(Condition(frequency_hz=166.0),), record_s=2.0)
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (150_000, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (330_000, resource.RLIM_INFINITY))
     try:
         run_campaign(rig, plan, store, campaign_id="full")
     except StoreError as error:
