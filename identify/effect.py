@@ -140,6 +140,7 @@ class Effect:
     needs: tuple[str, ...] = ()  # a "pressure" measured, or a "velocity" alone; a "flame_pole"
     generalises: tuple[str, ...] = ()  # effects of which this is an extension, not a rival
     mode_count: int | None = None  # only for declared models of that many modes
+    modal: tuple[str, ...] = ()  # damping ratios that must be a mode's: with more, it is a shape
     located: tuple[str, ...] = ()  # parameters known to within their size, or it is not seen at all
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred

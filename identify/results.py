@@ -381,6 +381,8 @@ class Whereabouts:
                 f"No one place takes it up; effects of the {where} together leave χ²/dof "
                 f"{self.together:.3g} ({sizes})."
             )
+        if len(self.likely) == len(PLACES) and not self.from_run_to_run:
+            return f"It cannot be located: no place in the loop is ruled out ({sizes})."
         partly = min(self.left.values()) > PARTLY and not self.from_run_to_run
         sure = "lies" if len(self.likely) == 1 and not partly else "may lie"
         where = " or the ".join(PLACES[p] for p in self.likely)

@@ -19,11 +19,17 @@ from simulated_rig.plant import Mode, Preform, SideResonator
 
 
 def parameter(
-    unit: str, barely: float, gross: float, signed: bool = False, graded: bool = True
+    unit: str,
+    barely: float,
+    gross: float,
+    signed: bool = False,
+    graded: bool = True,
+    turns: bool = False,
 ) -> Any:
     """A field of an effect: unit, and its range from barely visible to gross (log-uniform).
 
-    One that is not `graded` (where a mode lies) says nothing of the effect's size.
+    One that is `signed` is drawn of either sign, one that `turns` may be asked for below zero too;
+    one that is not `graded` (where a mode lies) says nothing of the effect's size.
     """
     return field(
         metadata={
@@ -32,6 +38,7 @@ def parameter(
             "gross": gross,
             "signed": signed,
             "graded": graded,
+            "turns": turns,
         }
     )
 
@@ -308,12 +315,12 @@ class SpeakerDelay(Effect):
 
 @dataclass(frozen=True)
 class Compression(Effect):
-    """Amplitude compression between the recorded drive and the sound: u − κ u³."""
+    """Amplitude compression between the recorded drive and the sound, or expansion: u − κ u³."""
 
     name = "actuator_nonlinearity"
     location = "actuator"
     variant = "compression"
-    cubic_per_v2: float = parameter("1/V^2", 0.0005, 0.03)
+    cubic_per_v2: float = parameter("1/V^2", 0.0005, 0.03, turns=True)
 
     def apply(self, config: RigConfig) -> RigConfig:
         actuator = replace(config.plant.actuator, cubic_per_v2=self.cubic_per_v2)
@@ -621,7 +628,7 @@ def _require_plausible(key: str, kind: type[Effect], parameters: Mapping[str, An
         value, high = parameters[f.name], FAR * max(told["barely"], told["gross"])
         vanishes = told["graded"] and told["gross"] > told["barely"]
         low = 0.0 if vanishes else min(told["barely"], told["gross"]) / FAR
-        if told["signed"]:
+        if told["signed"] or told["turns"]:
             low = -high
         if not is_number(value) or not low <= value <= high:
             raise ValueError(

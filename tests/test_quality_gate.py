@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 from identify.identification import prepare
 from identify.quality import Quality, inspect, tones
@@ -287,6 +288,30 @@ def test_settling_runs(clean: Campaign, size: float, seconds: float, severity: s
     """A decay shifts the coefficient by size·τ/T: 1e-4 (harmless), 3e-3, 3e-3 and 1e-2."""
     _, flags, _ = judged(clean, transient(size, seconds))
     assert flags == ({} if severity is None else {"unsettled": severity})
+
+
+@pytest.mark.parametrize("seconds", [0.03, 0.06])
+def test_a_phase_that_settles_has_lost_no_samples(clean: Campaign, seconds: float) -> None:
+    """As where the drive begins just before the recording: it had been called dropped samples."""
+
+    def change(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        return np.asarray(CubicSpline(t, x)(t + 4e-4 * np.exp(-t / seconds)))
+
+    assert judged(clean, pressures(change))[1] == {"unsettled": "excluded"}
+
+
+@pytest.mark.parametrize(("part", "words"), [(np.s_[:1500], "first"), (np.s_[-1500:], "last")])
+def test_a_drive_that_comes_late_or_goes_early(clean: Campaign, part: slice, words: str) -> None:
+    """Its silence had been called a stuck converter."""
+
+    def change(x: np.ndarray, t: np.ndarray) -> np.ndarray:
+        x[part] = 0.0
+        return x
+
+    found, flags, _ = judged(clean, one("drive", change))
+    assert flags["unsettled"] == "excluded"
+    assert "repeated_samples" not in flags
+    assert any(f"drive is silent for the {words} 0.1" in f.detail for f in found.flags)
 
 
 def test_the_ringing_of_a_quiet_rig_is_no_limit_cycle(clean: Campaign) -> None:

@@ -33,6 +33,9 @@ class AcousticMode(Effect):
             q for i in range(1, more + 1) for q in _mode_parameters("" if i == 1 else str(i))
         )
         self.located = tuple(q.name for q in self.parameters if q.unit == "Hz")
+        # two that are overdamped follow whatever is smooth: an echo was claimed as such
+        dampings = tuple(q.name for q in self.parameters if ".damping" in q.name)
+        self.modal = dampings if more > 1 else ()
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         r, a = 0.02 * known.flame_residues[0], 0.02 * known.speaker_residues[0]

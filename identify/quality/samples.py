@@ -20,6 +20,7 @@ SIDE = 3  # periods averaged on either side of a step
 STEP_SIGMAS = 10.0
 STEP_SAMPLES = 0.4  # smallest step, in samples' worth of phase
 LONE = 0.3  # of a step of one channel against the other that any step elsewhere may have
+SUDDEN = 0.85  # of a step that must come within two periods: what relaxes takes longer
 BLOCK = 16  # samples that are equal elsewhere only when a buffer came twice
 HELD = 3  # equal samples in a row while the signal must have moved
 MANY_HELD = 20
@@ -79,6 +80,9 @@ def largest_step(view: View, phase: FloatArray) -> tuple[float, int] | None:
     at = int(np.argmax(np.abs(steps)))
     if abs(steps[at]) <= max(STEP_SIGMAS * sigma, STEP_SAMPLES * _per_sample(view)):
         return None
+    around = phase[at : at + 2 * SIDE + 1]
+    if np.max(np.abs(around[2:] - around[:-2])) < SUDDEN * abs(steps[at]):
+        return None  # as a run that begins before it has settled
     return float(steps[at]), at
 
 
@@ -179,6 +183,10 @@ def held(view: View) -> list[QualityFlag]:
         start, stop, stuck = held_runs(x, x - rest, 8 * high_frequency_noise(rest) + 4 * step)
         if start.size == 0:
             continue
+        silent = _silent_end(view, start, stop) if name == "drive" else None
+        if silent is not None:
+            out.append(silent)
+            continue
         extreme = (np.abs(x[start] - x.max()) <= step) | (np.abs(x[start] - x.min()) <= step)
         stuck &= ~extreme  # flat tops are clipping
         count = int(np.sum((stop - start)[stuck]))
@@ -192,6 +200,25 @@ def held(view: View) -> list[QualityFlag]:
         )
         out.append(finding(view.name, "repeated_samples", severity, detail))
     return out
+
+
+def _silent_end(
+    view: View, start: npt.NDArray[np.int64], stop: npt.NDArray[np.int64]
+) -> QualityFlag | None:
+    """The drive was switched on after the recording began, or off before it ended: it says nothing
+    for a whole period at least."""
+    rate, last = view.run.sample_rate_hz, view.rest.shape[1] - 1
+    for first, end in zip(start, stop, strict=True):
+        lasting = (end - first) / rate
+        if lasting * view.frequency_hz < 1.0 or (first > 0 and end < last):
+            continue
+        how = (
+            f"the drive is silent for the first {lasting:.3f} s: let it settle before recording"
+            if first == 0
+            else f"the drive is silent for the last {lasting:.3f} s: record while it drives"
+        )
+        return finding(view.name, "unsettled", "excluded", how)
+    return None
 
 
 def held_runs(

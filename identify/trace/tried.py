@@ -209,13 +209,14 @@ class Tried:
         # … which hides what has strayed as well
         most = MODAL if self.spread is None else OVERDAMPED
         dampings = (f"mode{i}.damping" for i in range(1, self.fit.structure.mode_count + 1))
-        overdamped = (n for n in dampings if not values[n] < most)
+        overdamped = [n for n in dampings if not values[n] < most]
+        overdamped += [n for e in self.effects for n in e.modal if not values[n] < OVERDAMPED]
         lost = (n for n in open_ if LOST * values[n] < known[n].stderr < np.inf)
         for names, what in (
             (outside, "at the edge of its range"),
             (lost, "not known by any order of magnitude"),
             (unseen, "within its own error of nothing"),
-            (overdamped, "no mode's"),
+            (iter(overdamped), "no mode's"),
         ):
             name = next(names, None)
             if name is not None:

@@ -270,6 +270,8 @@ def show_diagnosis(found: "Diagnosis") -> None:
     out.print(f"[bold]verdict: {found.verdict}[/bold]   ({found.seconds:.1f} s)")
     for effect in found.effects:
         form = f", {effect.form}" if effect.form else ""
+        if found.verdict == "ambiguous" and effect.effect != "interference":
+            form += ", if it is that"
         show_parameters(f"{effect.effect}{form} ({effect.location})", effect.parameters)
     if found.explanation:
         out.print(found.explanation, markup=False)
