@@ -200,8 +200,8 @@ class _End:
         self.place = self._next()
 
     def _next(self) -> float:
-        """Where to look next: nearest to the middle third of what is left to look in, so that it
-        shrinks whatever the secant says."""
+        """Where to look next: where the secant says, but no nearer than a tenth to either end of
+        what is left to look in, so that it shrinks."""
         near, far = self._inside, min(self._outside, self.room)
         if np.isfinite(self._above):
             share = (Z95 - self._rise) / (self._above - self._rise)

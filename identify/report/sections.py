@@ -67,13 +67,18 @@ def errors(result: Result) -> str:
         "Relative errors of the velocity's Fourier coefficients, the model's own steady state "
         "against the measured one. Noise floor: the validation error that noise alone would cause; "
         "below it, what noise and the uncertainty of the fitted parameters would cause together. "
-        "p of anything missing: the least of the fitted runs', the held-out runs' and the "
-        "candidates' scores', corrected for so many questions."
+        f"p of anything missing: {words.LEAST_P}."
     )
     return table(["", *heads], error_rows(result), note, tuple(numeric))
 
 
-CYCLE_HEAD = ["", "frequency (Hz)", "amplitude (m/s)", "harmonics 2, 3, … (dB)", "stability"]
+CYCLE_HEAD = [
+    "free limit cycle",
+    "frequency (Hz)",
+    "amplitude (m/s)",
+    "harmonics 2, 3, … (dB)",
+    "stability",
+]
 
 
 def cycle_rows(result: Result) -> list[list[str]]:
@@ -220,7 +225,7 @@ def limit_cycle(result: Result) -> str:
     rows = cycle_rows(result)
     if not rows:
         return ""
-    return table(["free limit cycle", *CYCLE_HEAD[1:]], rows, "", (1, 2))
+    return table(CYCLE_HEAD, rows, "", (1, 2))
 
 
 def quality(result: Result) -> str:

@@ -65,8 +65,7 @@ def _final(result: Result) -> Any:
 
 def _cycle(result: Result) -> str:
     rows = sections.cycle_rows(result)
-    head = ["free limit cycle", *sections.CYCLE_HEAD[1:]]
-    return plain_table(head, rows, right=(1, 2)) if rows else ""
+    return plain_table(sections.CYCLE_HEAD, rows, right=(1, 2)) if rows else ""
 
 
 def _validation(result: Result) -> str:

@@ -55,12 +55,11 @@ def p_is(p: float) -> str:
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
-def asked(p: float) -> str:
-    """The p-value of the question whether there is anything to explain, and of what it is."""
-    return (
-        f"{p_is(p)}, the least of the fitted runs', the held-out runs' and the candidates' "
-        "scores', corrected for so many questions"
-    )
+#: What the p-value is of the question whether anything is missing from the declared model.
+LEAST_P = (
+    "the least of the fitted runs', the held-out runs' and the candidates' scores', corrected for "
+    "so many questions"
+)
 
 
 def unit(name: str) -> str:
@@ -136,7 +135,9 @@ def _diagnosis(d: Diagnosis) -> Heading:
     evidence = []
     if d.before.fit.converged:
         evidence.append(_misfit("The declared model", d.before))
-        evidence.append(f"Whether anything is missing from it: {asked(d.residual.p_value)}.")
+        evidence.append(
+            f"Whether anything is missing from it: {p_is(d.residual.p_value)}, {LEAST_P}."
+        )
     else:
         evidence.append(f"The declared model's fit did not converge: {d.before.fit.reason}.")
     headline = VERDICTS[d.verdict]

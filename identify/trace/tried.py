@@ -216,9 +216,9 @@ class Tried:
             (outside, "at the edge of its range"),
             (lost, "not known by any order of magnitude"),
             (unseen, "within its own error of nothing"),
-            (iter(overdamped), "no mode's"),
+            (overdamped, "no mode's"),
         ):
-            name = next(names, None)
+            name = next(iter(names), None)
             if name is not None:
                 return f"{name} is {what} ({values[name]:.3g})"
         return ""

@@ -216,7 +216,7 @@ def show_errors(found: "Identification | Diagnosis") -> None:
     heads = [name for name, _ in sections.columns(found)]
     table(sections.errors_title(found), ("", *heads), sections.error_rows(found))
     if rows := sections.cycle_rows(found):
-        table("free limit cycle", sections.CYCLE_HEAD, rows)
+        table("", sections.CYCLE_HEAD, rows)
 
 
 def show_validation(found: "Identification") -> None:
