@@ -235,6 +235,7 @@ def _solved(
         period_waves(v.shape[2], _samples(near.N, v.shape[2])),
     )
     terms = near.P, near.Q, near.dP, near.dQ
+    v = np.ascontiguousarray(v)  # of one kind: another would be compiled for again
     found = newton(*terms, curves, v, omega, *waves, free, left, TOLERANCE)
     return v, omega, *found
 

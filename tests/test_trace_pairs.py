@@ -1,6 +1,8 @@
 """Two gross effects sought at once: each alone leads the search for the other astray."""
 
+import tracemalloc
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +14,9 @@ from identify.effect import Effect
 from identify.effects import CATALOGUE, by_key
 from identify.executor import InProcess
 from identify.fit import fit_orbits
+from identify.start.rough import coarse
 from identify.structure import MODAL, Structure
-from identify.trace import law_steps
+from identify.trace import law_steps, pairs
 from identify.trace.contesting import DOUBT, one_more
 from identify.trace.contests import NEAR, varied
 from identify.trace.exchange import forms_in_place, joins
@@ -22,6 +25,7 @@ from identify.trace.foreseen import foreseen
 from identify.trace.pairs import STANDING, pairs_from_afar, representatives
 from identify.trace.places import within_a_place
 from identify.trace.restated import renamed
+from identify.trace.sizes import known_sizes
 from identify.trace.tried import best_form, tried
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import MOST_TWO, random_rig
@@ -64,6 +68,32 @@ def test_a_further_mode_beside_another_gross_effect(tmp_path: Path) -> None:
     assert abs(delay.value - DELAY_S) < 4 * delay.stderr
     assert said[0].startswith("seeking ")
     assert said[-1] == "refitting pairs"
+
+
+def test_of_a_pair_of_many_values_each_is_tried_and_few_at_a_time(tmp_path: Path) -> None:
+    """Three modes, and two delays that are each started from at 25 values: with the modes that do
+    not sing anywhere, half a million starts. Every value is tried somewhere, and what is solved for
+    at once behind an amplifier that clips (2048 samples a period) fits into little memory."""
+    rig = random_rig(3005, noise_db=50.0, modes=(3,))
+    ready = record(tmp_path, 3005, rig, [], forced=8, validation=2, modes=3)
+    base, rough = start.fit_from_data(ready.structure, ready.data), ready.data.coarse()
+    known = known_sizes(ready.data, base)
+    delays = by_key("flame_delay"), by_key("actuator_dynamics:delay")
+    pair = pairs._Pair(ready.structure, delays, ready.data, rough, known, ())
+    rows = [(*a, *b) for a, b in product(*(e.starts(known) for e in delays))]
+    found = pairs._anywhere(pair, rows)
+    inner = len(ready.structure.parameters)
+    assert len(rows) == len({tuple(np.round(s.theta[inner:], 6)) for s in found}) == 625
+    assert len(found) < 1.1 * 4 * pairs.PLACED  # each with flame residues of either sign
+    clipped = ready.structure.with_effects(by_key("actuator_nonlinearity:clipping"))
+    level = np.log(0.5 * known.drive_amplitude)
+    starts = [np.r_[s.theta[:inner], level] for s in found[:1024]]
+    tracemalloc.start()
+    try:
+        assert len(coarse(clipped, rough, starts)) > 900
+        assert tracemalloc.get_traced_memory()[1] < 3e8  # of all at once 1.0e9
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.slow

@@ -23,7 +23,8 @@ def unbent(read: ComplexArray, a: Any, power: int) -> Any:
     """Harmonics (rows, K) of what was heard less what was read, of p + a pⁿ less its mean: p of no
     mean that this is said of. `a` is a number, (rows, 1), or a Dual of either."""
     r, K = to_time(read, read.shape[1]), read.shape[1]
-    size = np.broadcast_to(np.asarray(dual.value(a), dtype=float), (r.shape[0], 1))[:, 0]
+    # of one kind whatever it was made of: another kind would be compiled for again
+    size = np.array(np.broadcast_to(dual.value(a), (r.shape[0], 1))[:, 0], dtype=float)
     more, by_size = _solved(r, size, power)
     return to_harmonics(dual.chain(more, (by_size, a)), K)
 
@@ -38,7 +39,8 @@ def _solved(r, size, power):  # type: ignore[no-untyped-def]
     loudest = LOUDEST * np.max(np.abs(r))
     for i in range(rows):
         a = size[i]
-        p[:] = r[i]
+        for t in range(T):
+            p[t] = r[i, t]
         for _ in range(STEPS):
             weight, mean = 0.0, 0.0
             for t in range(T):
@@ -55,7 +57,11 @@ def _solved(r, size, power):  # type: ignore[no-untyped-def]
                 largest = max(largest, abs(step))
             if largest < EXACT * loudest:
                 break
-        mean = np.sum(p**power * inverse) / weight
-        more[i] = p - r[i]
-        by_size[i] = (mean - p**power) * inverse
+        mean = 0.0
+        for t in range(T):
+            rest[t] = p[t] ** power
+            mean += rest[t] * inverse[t] / weight
+        for t in range(T):
+            more[i, t] = p[t] - r[i, t]
+            by_size[i, t] = (mean - rest[t]) * inverse[t]
     return more, by_size

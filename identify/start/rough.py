@@ -18,6 +18,7 @@ from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
 
+AT_ONCE = 256  # starts solved for side by side: thousands need gigabytes, and are no faster
 WIDTHS = {"frequency": 0.1, "damping": 1.0, "pole": 1.0, "delay": 2.0}  # of `_weak_pulls`
 
 
@@ -33,13 +34,14 @@ def coarse(
     structure: Structure, data: Dataset, starts: Iterable[FloatArray], share: float = 0.1
 ) -> list[CoarseStart]:
     """Starts with their misfit at ten per cent noise (or another `share`), best first."""
-    thetas = list(starts)
-    if not thetas:
-        return []
+    every = list(starts)
     residual = OrbitResidual(structure, soften(data.fit, share), newton_steps=2)
-    outcome = residual(np.stack(thetas), np.arange(len(thetas)), False)
-    costs = np.where(outcome.exists, np.sum(outcome.residual**2, axis=1), np.inf)
-    found = [CoarseStart(float(c), t) for c, t in zip(costs, thetas, strict=True)]
+    found = []
+    for first in range(0, len(every), AT_ONCE):
+        thetas = every[first : first + AT_ONCE]
+        outcome = residual(np.stack(thetas), np.arange(len(thetas)), False)
+        costs = np.where(outcome.exists, np.sum(outcome.residual**2, axis=1), np.inf)
+        found += [CoarseStart(float(c), t) for c, t in zip(costs, thetas, strict=True)]
     return sorted((c for c in found if np.isfinite(c.cost)), key=lambda c: c.cost)
 
 

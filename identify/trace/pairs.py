@@ -26,6 +26,7 @@ from identify.trace.tried import Tried, few_of_each, tried
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
 SIDE_BY_SIDE = 16  # starts of a pair without a further mode that are led on …
 ANYWHERE = 64  # … and with several declared modes beside the one that sings
+PLACED = 1500  # values of a pair's effects with places of these modes that are tried at the most
 NEARER = 40  # pairs that come to the second stage …
 NEAREST = 6  # … and that are refitted in full
 BEST_SINGLES = 3  # whose forms stand for their effects too
@@ -146,12 +147,27 @@ def _lead(pair: _Pair) -> _Led:
         each = (e.starts(pair.known) for e in pair.effects)
         rows = [(*first, *second) for first, second in product(*each)]
         placements, many = pair.placements, SIDE_BY_SIDE
-        if pair.plain.mode_count > 2:  # several others trade off each other: wherever they may be
-            placements, many = tuple(dense_placements(pair.plain.mode_count - 1)), ANYWHERE
-    starts = signed_starts(sought, pair.rough, rows, placements)[:many]
+    if pair.richer is None and pair.plain.mode_count > 2:  # the others trade off each other
+        starts, many = _anywhere(pair, rows), ANYWHERE
+    else:
+        starts = signed_starts(sought, pair.rough, rows, placements)
     # most of them fall behind at once
-    ahead = polish(sought, pair.rough, starts, (FIRST,), 2)[: max(6, many // 4)]
+    ahead = polish(sought, pair.rough, starts[:many], (FIRST,), 2)[: max(6, many // 4)]
     return _Led(pair, tuple(polish(sought, pair.rough, ahead, (FIRST,), 4)[:3]))
+
+
+def _anywhere(pair: _Pair, rows: Sequence[tuple[float, ...]]) -> list[CoarseStart]:
+    """Starts with the modes that do not sing anywhere, best first. Where the effects' own values
+    are many, each row of them is tried with its share of the places, in turn: next to it is one
+    that is tried with others."""
+    places = dense_placements(pair.plain.mode_count - 1)
+    shares = min(len(places), -(-len(rows) * len(places) // PLACED))
+    found = [
+        start
+        for i in range(shares)
+        for start in signed_starts(pair.sought, pair.rough, rows[i::shares], places[i::shares])
+    ]
+    return sorted(found, key=lambda start: start.cost)
 
 
 def _lead_on(led: _Led) -> _Led:
