@@ -31,6 +31,7 @@ IntArray = npt.NDArray[np.int64]
 
 BY_RUN = ("omega", "time", "flame_on", "identity", "free", "spacing_m")
 BY_HARMONIC = ("drive", "pressure", "velocity")
+MANY = 64  # rows among which it pays to look for those that are alike
 FINE = 2048  # samples a period behind an amplifier: corners alias below 1e-6
 
 
@@ -327,11 +328,30 @@ def driven(effects: Sequence[Effect], p: Values, at: Conditions, drive: Any) -> 
     curves = [e for e in effects if type(e).amplifier is not Effect.amplifier]
     if curves and np.any(dual.value(drive)):
         samples = None if len(curves) == 1 and curves[0].smooth else FINE
-        in_turn = [partial(e.amplifier, p) for e in sorted(curves, key=lambda e: e.rails)]
-        drive = _bent(in_turn, drive, samples)
+        in_turn = sorted(curves, key=lambda e: e.rails)
+        own = {q.name: p[q.name] for e in curves for q in e.parameters}
+        each, again = _alike(own, drive)
+        if each is not None:
+            own, drive = {name: value[each] for name, value in own.items()}, drive[each]
+        bent = _bent([partial(e.amplifier, own) for e in in_turn], drive, samples)
+        drive = bent if each is None else bent[again]
     for e in effects:
         drive = e.drive(p, at, drive)
     return drive
+
+
+def _alike(own: Values, drive: Any) -> tuple[IntArray, IntArray] | tuple[None, None]:
+    """Of many rows that are given the same drive and the same parameters one each, and where each
+    row finds its own among them: thousands of starts differ in all but what the amplifier does.
+    Neither, where few are alike, or derivatives are wanted."""
+    columns, rows = [drive, *own.values()], drive.shape[0]
+    plain = all(isinstance(c, np.ndarray) and len(c) == rows for c in columns)
+    if rows < MANY or not plain:
+        return None, None
+    table = np.ascontiguousarray(np.concatenate(columns, axis=1, dtype=complex))
+    keys = table.view(np.dtype((np.void, table[0].nbytes)))[:, 0]
+    _, each, again = np.unique(keys, return_index=True, return_inverse=True)
+    return (each, again) if 2 * len(each) < rows else (None, None)
 
 
 def _bent(curves: Sequence[Callable[[FloatArray], Bent]], drive: Any, samples: int | None) -> Any:

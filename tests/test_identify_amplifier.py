@@ -79,3 +79,22 @@ def test_derivatives_behind_a_distortion_agree_with_differences(form: str) -> No
         assert size > 0, names[j]
         error = np.max(np.abs(exact.d[..., j] - difference))
         assert error < (CORNERS if form in CORNERED else 1e-6) * size, names[j]
+
+
+@pytest.mark.parametrize("form", SIZES)
+def test_of_many_starts_alike_each_gets_its_own(form: str) -> None:
+    """Two values in turn for hundreds of starts that differ elsewhere: what is reckoned once for
+    all that are alike is what each alone would get, exactly."""
+    structure, vector = structure_with(form)
+    at, own = two_volts(), structure.parameters.index[structure.effects[0].parameters[0].name]
+    vectors = np.tile(vector, (200, 1))
+    vectors[:, 0] += np.linspace(0.0, 0.1, 200)
+    vectors[1::2, own] += 0.02
+    rows = at.tile(len(vectors))
+    found = driven(
+        structure.effects, structure.parameters.plain(vectors, at.runs), rows, rows.drive
+    ).reshape(len(vectors), at.runs, K)
+    for one in (0, 1):
+        alone = driven(structure.effects, structure.parameters.plain(vectors[one]), at, at.drive)
+        np.testing.assert_array_equal(found[one::2], np.tile(alone, (100, 1, 1)))
+    assert not np.array_equal(found[0], found[1])
