@@ -12,11 +12,13 @@
 Campaigns come from the simulated rig's own physics (random rigs, 30 to 80 dB noise, white or
 coloured, 4 to 16 runs); the diagnosis sees arrays only. Prints verdicts, wrong claims, a confusion
 table by effect, how often 95 % intervals of traced effects hold the truth and what validation is
-left, and writes one JSON line a campaign to `--out`; `--again FILE` reports on such lines alone.
+left. `--out FILE` gets one JSON line a campaign, and the next call with it goes on where the last
+one ended, unless `identify` has changed since; `--again FILE` reports on such lines alone.
 With `--given` the true effects are the only candidates: how well their sizes are known, quickly.
 """
 
 import argparse
+import hashlib
 import json
 import sys
 import time
@@ -388,6 +390,21 @@ def report(records: list[dict[str, Any]]) -> None:
             print("wrong:", r["seed"], r["truth"], "claimed", r["claimed"], "χ²/dof", r["chi2"])
 
 
+def code() -> str:
+    """Which state of `identify` diagnosed: lines of another are not counted with these."""
+    digest = hashlib.sha256()
+    root = Path(identify.__file__).parent
+    for path in sorted(root.rglob("*.py")):
+        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def read(file: Path, mode: str) -> list[dict[str, Any]]:
+    """The lines of an earlier `--out` that are of this mode."""
+    lines = file.read_text(encoding="utf-8").splitlines()
+    return [r for r in map(json.loads, lines) if r["mode"] == mode]
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("mode", choices=("clean", "effects", "leftout", *TURBULENT, *OWN_RIG))
@@ -396,25 +413,28 @@ def main() -> int:
     parser.add_argument("--only", help="effects whose key starts so")
     parser.add_argument("--given", action="store_true", help="no candidate but what is there")
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="one JSON line a campaign; goes on where it ended")
     parser.add_argument("--again", type=Path, help="report on the lines of an earlier --out")
     given = parser.parse_args()
     if given.again is not None:
-        lines = given.again.read_text().splitlines()
-        report([r for r in map(json.loads, lines) if r["mode"] == given.mode])
+        report(read(given.again, given.mode))
         return 0
+    same = {"code": code(), "only": given.only, "given": given.given}
+    done = {}
+    if given.out and given.out.exists():
+        earlier = read(given.out, given.mode)
+        done = {r["seed"]: r for r in earlier if same.items() <= r.items()}
     seeds = range(given.first, given.first + given.count)
-    tasks = [(given.mode, s, given.only, given.given) for s in seeds]
-    records = []
+    tasks = [(given.mode, s, given.only, given.given) for s in seeds if s not in done]
     with ProcessPoolExecutor(given.jobs) as pool:
         for i, record in enumerate(pool.map(one, tasks)):
-            records.append(record)
+            done[record["seed"]] = record | same
             if given.out:
-                with given.out.open("a") as file:
-                    file.write(json.dumps(record) + "\n")
+                with given.out.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(record | same) + "\n")
             if sys.stderr.isatty() or (i + 1) % 20 == 0:
                 print(f"{i + 1}/{len(tasks)}", file=sys.stderr)
-    report(records)
+    report([done[seed] for seed in seeds])
     return 0
 
 
