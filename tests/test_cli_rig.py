@@ -83,6 +83,11 @@ def test_campaign_run_list_and_show(plan: Path, capfd: pytest.CaptureFixture[str
     code, out, _ = entrain(capfd, "store", "export", result["campaign"], plan.parent / "out.zip")
     assert code == 0
     assert (plan.parent / "out.zip").exists()
+    code, _, err = entrain(
+        capfd, "store", "export", result["campaign"], plan.parent / "no" / "o.zip"
+    )
+    assert code == 2
+    assert "give a file in a folder that exists" in " ".join(err.replace("│", " ").split())
 
 
 def test_design_writes_a_plan_that_a_campaign_takes(

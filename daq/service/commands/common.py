@@ -29,7 +29,7 @@ StoreOption = Annotated[
 ]
 
 
-def _writable(place: Path | None) -> Path | None:
+def writable(place: Path | None) -> Path | None:
     """Refuse a place that cannot be written to before the work that it is for."""
     if place is None or str(place) == "-":
         return place
@@ -45,7 +45,7 @@ def _drawable(place: Path | None) -> Path | None:
     """Refuse a figure of another format than we draw, too."""
     if place is not None and place.suffix.lower() not in FIGURES:
         raise typer.BadParameter(f"{str(place)!r} does not end in {', '.join(FIGURES)}")
-    return _writable(place)
+    return writable(place)
 
 
 def folder_to_be(place: Path) -> Path:
@@ -73,18 +73,18 @@ def positive(value: float | None) -> float | None:
 
 JsonOption = Annotated[
     Path | None,
-    typer.Option("--json", help="Also write the result as JSON; - for stdout.", callback=_writable),
+    typer.Option("--json", help="Also write the result as JSON; - for stdout.", callback=writable),
 ]
 HtmlOption = Annotated[
     Path | None,
-    typer.Option("--html", help="Also write a self-contained HTML report.", callback=_writable),
+    typer.Option("--html", help="Also write a self-contained HTML report.", callback=writable),
 ]
 FigureOption = Annotated[
     Path | None,
     typer.Option("--figure", help="Also write a figure (.png, .svg, .pdf).", callback=_drawable),
 ]
 PlanOption = Annotated[
-    Path, typer.Option("--out", help="Where the plan goes; - for stdout.", callback=_writable)
+    Path, typer.Option("--out", help="Where the plan goes; - for stdout.", callback=writable)
 ]
 
 

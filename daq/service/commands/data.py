@@ -13,6 +13,7 @@ from daq.service.commands.common import (
     out,
     positive,
     table,
+    writable,
 )
 
 if TYPE_CHECKING:
@@ -208,7 +209,7 @@ def verify(
 @store_app.command("export")
 def export(
     campaign: Annotated[str, typer.Argument(help="Campaign id.")],
-    target: Annotated[Path, typer.Argument(help="The zip file to write.")],
+    target: Annotated[Path, typer.Argument(help="The zip file to write.", callback=writable)],
     store: StoreOption = None,
 ) -> None:
     """Write a campaign as one zip with a manifest of checksums."""
