@@ -335,6 +335,30 @@ def intervals(used: list[dict[str, Any]]) -> None:
                   f"above 1.5 in {sum(x > 1.5 for x in left)} of {len(left)}")  # fmt: skip
 
 
+def confusion(used: list[dict[str, Any]]) -> None:
+    """What was claimed, by what was there: each effect of a campaign counts in its row, and what
+    was claimed beside or instead of it in the columns."""
+    names = sorted({t["effect"] for r in used for t in r["truth"]})
+    names += sorted({c["effect"] for r in used for c in r["claimed"]} - set(names))
+    verdicts = ("ambiguous", "unexplained", "no_discrepancy")
+    print("confusion: rows what was there, columns what was claimed, or else the verdict")
+    print(" " * 30 + "".join(f"{i:4d}" for i in range(1, len(names) + 1)) + "  amb  une  none")
+    for i, name in enumerate([*names, "nothing"], start=1):
+        row: Counter[str] = Counter()
+        for r in used:
+            there = {t["effect"] for t in r["truth"]} or {"nothing"}
+            claimed = {c["effect"] for c in r["claimed"]} if r["verdict"] == "traced" else set()
+            if name in there:
+                others = claimed - there
+                row.update(
+                    ({name} & claimed) | others or ({"missed"} if claimed else {r["verdict"]})
+                )
+        cells = "".join(f"{row[n] or '.':>4}" for n in names)
+        rest = "".join(f"{row[v] or '.':>5}" for v in verdicts)
+        missed = f"   not seen beside another: {row['missed']}" if row["missed"] else ""
+        print(f"    {f'{i} {name}' if name != 'nothing' else name:26s}{cells}{rest}{missed}")
+
+
 def by_excess(used: list[dict[str, Any]]) -> None:
     """Outcomes by how far the whitened residual of the declared model exceeds the noise."""
     edges = (0.0, *EXCESS, np.inf)
@@ -383,6 +407,7 @@ def report(records: list[dict[str, Any]]) -> None:
         table.setdefault(key, Counter())[outcome(r)] += 1
     for key, row in sorted(table.items()):
         print(f"    {key:55s} {dict(row)}")
+    confusion(used)
     by_excess(used)
     intervals(used)
     for r in used:
