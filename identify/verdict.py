@@ -122,7 +122,21 @@ def judge(
         )
     else:
         said = "No known effect explains the data to within noise."
-    return "unexplained", chosen, said + left
+    return "unexplained", chosen, said + left + _but_for_values(declared, tried)
+
+
+def _but_for_values(declared: Declared, tried: Sequence[Tried]) -> str:
+    """Which law of one effect or two would explain the data, if its values could be true."""
+    near = [
+        t
+        for t in tried
+        if t.spread is None and t.adequate and not t.plausible and len(t.effects) < 3
+        if trace.accounts(t, declared.model, tried)
+    ]
+    if not near:
+        return ""
+    best = trace.best_form(near)
+    return f" Adding {best.words} would leave no more than noise, but {best.implausibility}."
 
 
 def _not_contradicted(fit: Fit) -> str:

@@ -118,3 +118,20 @@ def test_only_what_has_come_to_an_end_is_claimed(
     assert found == verdict
     if verdict == "unexplained":
         assert f"flame_delay comes near to the data, with no values: {reason}" in said
+
+
+def test_what_explains_with_values_that_cannot_be_true_is_named_and_not_claimed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A pair that left nothing had been passed over in silence, the node of a mode
+    too near the flame for the range of its ratio (effects 80064)."""
+    monkeypatch.setattr(Tried, "implausibility", "its delay is at the edge of its range (1)")
+    declared = Declared(tried_as(fitted(9, 40.0)), None, {}, 0.0)  # type: ignore[arg-type]
+    delay = tried_as(fitted(10, 1.0), "flame_delay")
+    data = SimpleNamespace(validation=(), noise_floor=lambda batches: 1e-3)
+    found, chosen, said = judge(declared, [delay], data)  # type: ignore[arg-type]
+    assert (found, chosen) == ("unexplained", None)
+    assert said == (
+        "No known effect explains the data to within noise. Adding flame_delay would leave no more "
+        "than noise, but its delay is at the edge of its range (1)."
+    )
