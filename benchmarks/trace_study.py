@@ -237,7 +237,11 @@ def one(task: tuple[str, int, str | None, bool]) -> dict[str, Any]:
              "parameters": {n: [v.value, v.stderr] for n, v in e.parameters.items()}}
             for e in d.effects
         ],
-        "fitted": {n: [v.value, v.stderr] for n, v in d.after.fit.estimates.items()},
+        "fitted": {
+            n: [v.value, v.stderr]
+            for n, v in d.after.fit.estimates.items()
+            if n.startswith("mode") and n.endswith(("frequency_hz", "damping"))
+        },
         "last_s": max(c.started_s for c in d.before.comparisons),
         "best": [list(c.effects) for c in d.candidates[:4]],
         "where": [] if d.whereabouts is None else list(d.whereabouts.likely),
