@@ -1,8 +1,8 @@
 """SCPI instruments on a real TCP socket: a signal generator in four dialects, and a scope.
 
 Each answers only to its own spelling, keeps an error queue, clamps to its own limits, and logs
-every amplitude with its time. `hang` makes it swallow what it is asked, `drop` closes its
-connections, as instruments do.
+every amplitude with its time. `hang` makes it swallow what it is asked, and a connection on which
+it has is never answered again; `drop` closes its connections, as instruments do.
 """
 
 import asyncio
@@ -224,9 +224,11 @@ class ScpiServer:
     async def _talk(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
         self._writers.add(writer)
+        swallowed = False
         try:
             while line := await reader.readline():
-                if self.hang:
+                swallowed |= self.hang
+                if swallowed:
                     continue
                 answer = self.instrument.execute(line.decode("ascii").strip())
                 if answer is not None:
