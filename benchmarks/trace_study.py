@@ -351,12 +351,11 @@ def confusion(used: list[dict[str, Any]]) -> None:
         row: Counter[str] = Counter()
         for r in used:
             there = {t["effect"] for t in r["truth"]} or {"nothing"}
+            if name not in there:
+                continue
             claimed = {c["effect"] for c in r["claimed"]} if r["verdict"] == "traced" else set()
-            if name in there:
-                others = claimed - there
-                row.update(
-                    ({name} & claimed) | others or ({"missed"} if claimed else {r["verdict"]})
-                )
+            found = claimed & {name} | claimed - there
+            row.update(found or ({"missed"} if claimed else {r["verdict"]}))
         cells = "".join(f"{row[n] or '.':>4}" for n in names)
         rest = "".join(f"{row[v] or '.':>5}" for v in verdicts)
         missed = f"   not seen beside another: {row['missed']}" if row["missed"] else ""

@@ -110,6 +110,12 @@ def value(x: Operand) -> Array:
     return x.v if isinstance(x, Dual) else np.asarray(x)
 
 
+def column(x: Operand, rows: int) -> Array:
+    """The plain values of a number or a column (rows, 1), as an array (rows,) of its own: always of
+    one kind, because compiled code would be compiled again for another."""
+    return np.array(np.broadcast_to(value(x), (rows, 1))[:, 0], dtype=float)
+
+
 def derivative(x: Operand, shape: tuple[int, ...], seeds: int) -> Array:
     """Derivatives of shape ``shape + (seeds,)``; zeros for constants."""
     if isinstance(x, Dual):

@@ -57,7 +57,7 @@ def judge(
     settled = [t for t in good if t.has_values]  # of these alone one is claimed
     if settled:
         spreads = [t for t in tried if t.spread is not None and not t.explains]
-        implausible = [t for t in tried if t.spread is None and t.adequate and not t.plausible]
+        implausible = _implausible(tried)
         # of laws that differ little, one is not the surer for what is likelier than the other
         explaining = [*laws, *(t for t in good if t.spread is not None)]
         best, others = trace.claimed(settled, [*explaining, *spreads, *implausible])
@@ -125,14 +125,15 @@ def judge(
     return "unexplained", chosen, said + left + _but_for_values(declared, tried)
 
 
+def _implausible(tried: Sequence[Tried]) -> list[Tried]:
+    """Laws that leave no more than noise, with values that cannot be true."""
+    return [t for t in tried if t.spread is None and t.adequate and not t.plausible]
+
+
 def _but_for_values(declared: Declared, tried: Sequence[Tried]) -> str:
     """Which law of one effect or two would explain the data, if its values could be true."""
-    near = [
-        t
-        for t in tried
-        if t.spread is None and t.adequate and not t.plausible and len(t.effects) < 3
-        if trace.accounts(t, declared.model, tried)
-    ]
+    few = [t for t in _implausible(tried) if len(t.effects) < 3]
+    near = [t for t in few if trace.accounts(t, declared.model, tried)]
     if not near:
         return ""
     best = trace.best_form(near)

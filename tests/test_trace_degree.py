@@ -123,8 +123,8 @@ def test_only_what_has_come_to_an_end_is_claimed(
 def test_what_explains_with_values_that_cannot_be_true_is_named_and_not_claimed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A pair that left nothing had been passed over in silence, the node of a mode
-    too near the flame for the range of its ratio (effects 80064)."""
+    """A pair that left nothing had been passed over in silence: a mode's node lay nearer to the
+    flame than the range of its ratio allows (effects 80064)."""
     monkeypatch.setattr(Tried, "implausibility", "its delay is at the edge of its range (1)")
     declared = Declared(tried_as(fitted(9, 40.0)), None, {}, 0.0)  # type: ignore[arg-type]
     delay = tried_as(fitted(10, 1.0), "flame_delay")

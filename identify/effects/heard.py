@@ -23,8 +23,7 @@ def unbent(read: ComplexArray, a: Any, power: int) -> Any:
     """Harmonics (rows, K) of what was heard less what was read, of p + a pⁿ less its mean: p of no
     mean that this is said of. `a` is a number, (rows, 1), or a Dual of either."""
     r, K = to_time(read, read.shape[1]), read.shape[1]
-    # of one kind whatever it was made of: another kind would be compiled for again
-    size = np.array(np.broadcast_to(dual.value(a), (r.shape[0], 1))[:, 0], dtype=float)
+    size = dual.column(a, r.shape[0])
     more, by_size = _solved(r, size, power)
     return to_harmonics(dual.chain(more, (by_size, a)), K)
 

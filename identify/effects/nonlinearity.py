@@ -218,7 +218,7 @@ class Hysteresis(Effect):
 def play(w: Samples, width: Any) -> Passed:
     """The play operator over one period of samples `w` (runs, samples), of half-width `width`."""
     x = np.ascontiguousarray(w)
-    half = np.array(np.broadcast_to(dual.value(width), (x.shape[0], 1))[:, 0], dtype=float)
+    half = dual.column(width, x.shape[0])
     at, side = _contacts(x, half)
     # what was touched last is remembered: value and derivative of that moment
     out = np.take_along_axis(x, at, axis=1) + side * half[:, None]

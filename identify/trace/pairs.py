@@ -76,6 +76,12 @@ class _Pair:
             return self.richer.with_effects(self.effects[1])
         return self.plain.with_effects(*self.effects)
 
+    @property
+    def proposals(self) -> list[tuple[float, ...]]:
+        """Each of the first effect's own starting values with each of the second's."""
+        each = (e.starts(self.known) for e in self.effects)
+        return [(*first, *second) for first, second in product(*each)]
+
 
 @dataclass(frozen=True)
 class _Led:
@@ -138,29 +144,26 @@ def _named(pair: _Pair) -> str:
 
 def _lead(pair: _Pair) -> _Led:
     """The pair's starts through the first stage."""
-    sought = pair.sought
+    sought, rough = pair.sought, pair.rough
     if pair.richer is not None:
-        rows = [pair.effects[1].neutral() or pair.effects[1].starts(pair.known)[0]]
-        placements = tuple(dense_placements(sought.mode_count - 1))
+        row = pair.effects[1].neutral() or pair.effects[1].starts(pair.known)[0]
+        starts = signed_starts(sought, rough, [row], dense_placements(sought.mode_count - 1))
         many = OF_MODES
+    elif pair.plain.mode_count > 2:  # the others trade off each other
+        starts, many = _anywhere(pair), ANYWHERE
     else:
-        each = (e.starts(pair.known) for e in pair.effects)
-        rows = [(*first, *second) for first, second in product(*each)]
-        placements, many = pair.placements, SIDE_BY_SIDE
-    if pair.richer is None and pair.plain.mode_count > 2:  # the others trade off each other
-        starts, many = _anywhere(pair, rows), ANYWHERE
-    else:
-        starts = signed_starts(sought, pair.rough, rows, placements)
+        starts = signed_starts(sought, rough, pair.proposals, pair.placements)
+        many = SIDE_BY_SIDE
     # most of them fall behind at once
-    ahead = polish(sought, pair.rough, starts[:many], (FIRST,), 2)[: max(6, many // 4)]
-    return _Led(pair, tuple(polish(sought, pair.rough, ahead, (FIRST,), 4)[:3]))
+    ahead = polish(sought, rough, starts[:many], (FIRST,), 2)[: max(6, many // 4)]
+    return _Led(pair, tuple(polish(sought, rough, ahead, (FIRST,), 4)[:3]))
 
 
-def _anywhere(pair: _Pair, rows: Sequence[tuple[float, ...]]) -> list[CoarseStart]:
+def _anywhere(pair: _Pair) -> list[CoarseStart]:
     """Starts with the modes that do not sing anywhere, best first. Where the effects' own values
     are many, each row of them is tried with its share of the places, in turn: next to it is one
     that is tried with others."""
-    places = dense_placements(pair.plain.mode_count - 1)
+    rows, places = pair.proposals, dense_placements(pair.plain.mode_count - 1)
     shares = min(len(places), -(-len(rows) * len(places) // PLACED))
     found = [
         start
