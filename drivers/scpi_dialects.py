@@ -26,9 +26,11 @@ class Dialect:
     get_amplitude: str
     output_on: str
     output_off: str
+    get_output: str
     error_query: str = "SYST:ERR?"
     frequency_pattern: str = r"([-+0-9.eE]+)"
     amplitude_pattern: str = r"([-+0-9.eE]+)"
+    output_pattern: str = r"\b(ON|OFF|[01])\b"
     frequency_range: tuple[str, str] | None = None
     amplitude_range: tuple[str, str] | None = None
 
@@ -39,12 +41,18 @@ class Dialect:
             raise ValueError(f"no number like {pattern!r} in {answer!r}")
         return float(found.group(1))
 
+    def is_on(self, answer: str) -> bool:
+        """What `get_output` was answered. Raises `ValueError` when it says neither on nor off."""
+        found = re.search(self.output_pattern, answer, re.IGNORECASE)
+        if found is None:
+            raise ValueError(f"neither on nor off in {answer!r}")
+        return found.group(1).upper() in ("ON", "1")
+
 
 KEYSIGHT = Dialect(
     name="keysight",
     identity=r"(Agilent|Keysight|Hewlett).*,\s*(EDU)?33\d{3}",
     prepare=(
-        "OUTP{n} OFF",
         "SOUR{n}:FUNC SIN",
         "OUTP{n}:LOAD INF",
         "SOUR{n}:VOLT:UNIT VPP",
@@ -56,6 +64,7 @@ KEYSIGHT = Dialect(
     get_amplitude="SOUR{n}:VOLT?",
     output_on="OUTP{n} ON",
     output_off="OUTP{n} OFF",
+    get_output="OUTP{n}?",
     frequency_range=("SOUR{n}:FREQ? MIN", "SOUR{n}:FREQ? MAX"),
     amplitude_range=("SOUR{n}:VOLT? MIN", "SOUR{n}:VOLT? MAX"),
 )
@@ -63,7 +72,6 @@ RIGOL = Dialect(
     name="rigol",
     identity=r"Rigol.*,\s*DG\d",
     prepare=(
-        ":OUTP{n} OFF",
         ":SOUR{n}:FUNC SIN",
         ":OUTP{n}:LOAD INF",
         ":SOUR{n}:VOLT:UNIT VPP",
@@ -75,6 +83,7 @@ RIGOL = Dialect(
     get_amplitude=":SOUR{n}:VOLT?",
     output_on=":OUTP{n} ON",
     output_off=":OUTP{n} OFF",
+    get_output=":OUTP{n}?",
     error_query=":SYST:ERR?",
     frequency_range=(":SOUR{n}:FREQ? MIN", ":SOUR{n}:FREQ? MAX"),
     amplitude_range=(":SOUR{n}:VOLT? MIN", ":SOUR{n}:VOLT? MAX"),
@@ -82,22 +91,23 @@ RIGOL = Dialect(
 SIGLENT = Dialect(
     name="siglent",
     identity=r"Siglent.*,\s*SDG\d",
-    prepare=("C{n}:OUTP OFF", "C{n}:OUTP LOAD,HZ", "C{n}:BSWV WVTP,SINE", "C{n}:BSWV OFST,0"),
+    prepare=("C{n}:OUTP LOAD,HZ", "C{n}:BSWV WVTP,SINE", "C{n}:BSWV OFST,0"),
     set_frequency="C{n}:BSWV FRQ,{x}",
     get_frequency="C{n}:BSWV?",
     set_amplitude="C{n}:BSWV AMP,{x}",
     get_amplitude="C{n}:BSWV?",
     output_on="C{n}:OUTP ON",
     output_off="C{n}:OUTP OFF",
+    get_output="C{n}:OUTP?",
     frequency_pattern=r"FRQ,([-+0-9.eE]+)",
     amplitude_pattern=r"\bAMP,([-+0-9.eE]+)",
+    output_pattern=r"\bOUTP (ON|OFF)\b",
     # The instrument has no query for its limits; the rig's own hold.
 )
 TEKTRONIX = Dialect(
     name="tektronix",
     identity=r"Tektronix.*,\s*AFG\d",
     prepare=(
-        "OUTP{n}:STAT OFF",
         "SOUR{n}:FUNC:SHAP SIN",
         "OUTP{n}:IMP INF",
         "SOUR{n}:VOLT:UNIT VPP",
@@ -109,19 +119,21 @@ TEKTRONIX = Dialect(
     get_amplitude="SOUR{n}:VOLT:AMPL?",
     output_on="OUTP{n}:STAT ON",
     output_off="OUTP{n}:STAT OFF",
+    get_output="OUTP{n}:STAT?",
     frequency_range=("SOUR{n}:FREQ:FIX? MIN", "SOUR{n}:FREQ:FIX? MAX"),
     amplitude_range=("SOUR{n}:VOLT:AMPL? MIN", "SOUR{n}:VOLT:AMPL? MAX"),
 )
 GENERIC = Dialect(
     name="generic",
     identity=r"",
-    prepare=("OUTP OFF", "FUNC SIN"),
+    prepare=("FUNC SIN",),
     set_frequency="FREQ {x}",
     get_frequency="FREQ?",
     set_amplitude="VOLT {x}",
     get_amplitude="VOLT?",
     output_on="OUTP ON",
     output_off="OUTP OFF",
+    get_output="OUTP?",
 )
 DIALECTS = (KEYSIGHT, RIGOL, SIGLENT, TEKTRONIX, GENERIC)
 

@@ -10,6 +10,7 @@ kept in `fault` for the status and raised at the next `drive`.
 """
 
 import contextlib
+import math
 import threading
 import time
 from dataclasses import replace
@@ -21,6 +22,7 @@ from drivers.types import OutputLimits, Tone
 
 GRAIN_HZ = 1000.0  # the guard counts in milliseconds
 TICK_S = 0.02
+GIVE_UP_S = 1.0  # after which `close` leaves a device that does not confirm silence
 
 
 class ToneDevice(Protocol):
@@ -44,6 +46,7 @@ class SteppedOutput:
         self.guard = OutputGuard(limits, GRAIN_HZ, time.monotonic, 1, synthesise=False)
         self._wake = threading.Event()
         self._closing = False
+        self._give_up_s = math.inf
         self._sent_v = 0.0
         self._certain = True
         self.fault: str | None = None
@@ -120,6 +123,7 @@ class SteppedOutput:
         if self._closing:
             return
         self.silence()
+        self._give_up_s = time.monotonic() + GIVE_UP_S
         self._closing = True
         self._wake.set()
         self._thread.join()
@@ -138,7 +142,7 @@ class SteppedOutput:
                 last_s = now_s
                 self._send(self.guard.settle(grains).amplitude_v)
             quiet = self._sent_v == 0.0 and self._certain
-            if self._closing and (quiet or self.fault is not None):
+            if self._closing and (quiet or time.monotonic() > self._give_up_s):
                 return
 
     def _send(self, amplitude_v: float) -> None:

@@ -22,9 +22,9 @@ class ScpiGenerator:
         self._n = output
         self._on = True
         link.errors(self.dialect.error_query)  # what earlier users left
+        self._switch(on=False)
         for command in self.dialect.prepare:
             self._set(command)
-        self._on = False
         self._frequencies = self._range(
             self.dialect.frequency_range, self.dialect.frequency_pattern
         )
@@ -56,18 +56,33 @@ class ScpiGenerator:
         dialect = self.dialect
         if amplitude_v <= 0.0 or amplitude_v < self._least_v:
             # Off alone: generators refuse amplitudes below their least, zero among them.
-            self._set(dialect.output_off)
-            self._on = False
+            self._switch(on=False)
             return 0.0
         self._set(dialect.set_amplitude, 2.0 * amplitude_v)
         reached = self._get(dialect.get_amplitude, dialect.amplitude_pattern) / 2.0
         if not self._on:
-            self._set(dialect.output_on)
-            self._on = True
+            self._switch(on=True)
         return reached
 
     def close(self) -> None:
         self.link.close()
+
+    def _switch(self, *, on: bool) -> None:
+        """On or off, and seen to be: an instrument may lose a command and report no error."""
+        dialect = self.dialect
+        self._set(dialect.output_on if on else dialect.output_off)
+        question = dialect.get_output.format(n=self._n)
+        answer = self.link.query(question)
+        try:
+            is_on = dialect.is_on(answer)
+        except ValueError as error:
+            raise DeviceFault(f"{self.link.address}: {question!r}: {error}") from error
+        if is_on != on:
+            raise DeviceFault(
+                f"{self.link.address}: told to switch its output {'on' if on else 'off'}, "
+                f"the generator answers {answer!r} to {question!r}"
+            )
+        self._on = on
 
     def _set(self, template: str, value: float | None = None) -> None:
         # µHz and µV; always with a point, which every parser takes for a number.

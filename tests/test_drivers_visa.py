@@ -120,6 +120,36 @@ def test_a_setting_that_comes_out_different_is_a_fault_and_silence(keysight: Scp
     output.close()
 
 
+def test_a_lost_off_is_seen_and_told_again(server: ScpiServer) -> None:
+    """No error tells of a command that the instrument lost: only its state does."""
+    output, generator = opened(server)
+    output.drive(Tone(170.0, 1.0))
+    assert until(lambda: generator.on)
+    generator.deaf = 3
+    output.silence()
+    assert until(lambda: output.fault is not None)
+    assert "told to switch its output off" in str(output.fault)
+    assert until(lambda: not generator.on, 0.5)
+    output.close()
+    assert (output.output_v, generator.deaf) == (0.0, 0)
+
+
+def test_closing_tells_until_the_output_is_seen_to_be_off(keysight: ScpiServer) -> None:
+    output, generator = opened(keysight)
+    output.drive(Tone(170.0, 1.0))
+    assert until(lambda: generator.on)
+    generator.deaf = 6
+    output.close()
+    assert not generator.on
+
+
+def test_a_generator_that_stays_on_is_not_opened(keysight: ScpiServer) -> None:
+    assert isinstance(keysight.instrument, Generator)
+    keysight.instrument.deaf = 10
+    with pytest.raises(DeviceFault, match=r"answers '1' to 'OUTP1\?'"):
+        open_generator(keysight.address, LIMITS)
+
+
 def test_a_timeout_does_not_poison_the_next_query(keysight: ScpiServer) -> None:
     """The late answer must not be taken for the next question's: the link opens anew."""
     link = VisaLink(keysight.address, timeout_s=0.2)

@@ -81,6 +81,7 @@ class Generator(Instrument):
         self.identity = IDENTITIES[maker]
         self.frequency_hz, self.peak_to_peak_v, self.on = 1000.0, 5.0, True
         self.log: list[tuple[float, float]] = []
+        self.deaf = 0  # how many of the next switchings it loses without an error
         self.misset = 1.0  # a faulty attenuator sets this multiple of what it is told
 
     def note(self) -> None:
@@ -100,6 +101,8 @@ class Generator(Instrument):
             return self.ranged(command, self.peak_to_peak_v, 0.002, 20.0)
         if command in (f"{output} ON", f"{output} OFF"):
             return self.set_output(command.endswith("ON"))
+        if command == f"{output}?":
+            return ("OFF", "ON")[self.on] if self.maker == "rigol" else f"{self.on:d}"
         if re.match(rf"({ignored}) ", command):
             return None
         return super().handle(command)
@@ -107,6 +110,8 @@ class Generator(Instrument):
     def siglent(self, command: str) -> str | bytes | None:
         if command in ("C1:OUTP ON", "C1:OUTP OFF"):
             return self.set_output(command.endswith("ON"))
+        if command == "C1:OUTP?":
+            return f"C1:OUTP {('OFF', 'ON')[self.on]},LOAD,HZ,PLRT,NOR"
         if command.startswith("C1:BSWV FRQ,"):
             return self.set_frequency(float(command.partition(",")[2]))
         if command.startswith("C1:BSWV AMP,"):
@@ -139,6 +144,9 @@ class Generator(Instrument):
             self.errors.append('-222,"Data out of range"')
 
     def set_output(self, on: bool) -> None:
+        if self.deaf:
+            self.deaf -= 1
+            return
         self.on = on
         self.note()
 
