@@ -19,6 +19,7 @@ from identify import dual
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
+UNKNOWN = 1e50  # of any unit: a standard error of numbers that the data do not depend on
 EDGE = 1e-6  # of a bound: what is no farther from it has been stopped there
 
 
@@ -54,11 +55,15 @@ class Estimate:
     stderr: float
     unit: str
 
+    @property
+    def determined(self) -> bool:
+        """Whether the data depend on it at all."""
+        return bool(self.stderr < UNKNOWN)
+
     def to_json(self) -> dict[str, Any]:
-        finite = np.isfinite(self.stderr)
         return {
             "value": self.value,
-            "stderr": float(self.stderr) if finite else None,
+            "stderr": float(self.stderr) if self.determined else None,
             "unit": self.unit,
         }
 

@@ -49,8 +49,9 @@ def intervals(fit: Fit, data: Dataset) -> dict[str, Interval]:
     out = {}
     for name, e in estimates.items():
         low, high = e.interval(Z95)
-        known = np.isfinite(e.stderr)
-        out[name] = Interval(low if known else None, high if known else None, "gaussian")
+        out[name] = Interval(
+            low if e.determined else None, high if e.determined else None, "gaussian"
+        )
     doubtful = _doubtful(fit, data)
     for j, (low_end, high_end) in _profiled(fit, data, doubtful).items():
         out[fit.structure.parameters.names[j]] = Interval(low_end, high_end, "profile")

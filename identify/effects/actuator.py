@@ -113,7 +113,7 @@ class SpeakerPeak(Effect):
         Parameter("actuator_dynamics.peak", "1", -1.0, 50.0, scale=1e-2),
         *SpeakerResonance.parameters,
     )
-    located = SpeakerResonance.located
+    located = ("actuator_dynamics.peak", *SpeakerResonance.located)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         sizes = (0.5, -0.5)

@@ -77,7 +77,7 @@ def with_error(e: Estimate) -> tuple[str, str]:
     """(value, standard error) as text, to the digits that the standard error justifies."""
     if not math.isfinite(e.value):
         return "—", "—"
-    if not math.isfinite(e.stderr):
+    if not e.determined:
         return scientific(e.value, 4), "not determined"
     if e.stderr <= 0:
         return scientific(e.value, 6), "0"

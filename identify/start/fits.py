@@ -1,5 +1,6 @@
 """Fits from data alone: starts of every kind, led on until one reaches the noise or none does."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -137,8 +138,15 @@ def other_minima(structure: Structure, data: Dataset, near: Fit, times: float) -
     starts = _denser(structure, data.coarse(), near, data.free_hz)
     fits = [fit_orbits(structure, data, t, continuation=(0.003, 0.0)) for t in starts]
     for fit in sorted(fits, key=lambda f: f.chi2):
-        # of the same depth are those in which two modes have changed names
-        new = not any(abs(fit.chi2 - o.chi2) < SAME_DEPTH * o.chi2 for o in out)
-        if fit.converged and new and fit.chi2 < times * near.chi2:
-            out.append(fit)
+        if fit.chi2 < times * near.chi2 and not _known(fit, out):
+            end = fit
+            if not fit.converged:  # without what the model lacks, a valley may be long
+                end = fit_orbits(structure, data, fit.theta, continuation=(0.0,), iterations=LONG)
+            if end.converged and not _known(end, out):
+                out.append(end)
     return out[1:]
+
+
+def _known(fit: Fit, others: Sequence[Fit]) -> bool:
+    """Whether one of `others` is as deep: the same, maybe with two modes' names exchanged."""
+    return any(abs(fit.chi2 - o.chi2) < SAME_DEPTH * o.chi2 for o in others)
