@@ -20,12 +20,14 @@ from identify.pieces import Mode
 from identify.scatter import Spread, fit_scatter
 from identify.structure import MODAL, Structure
 from identify.trace import contesting, law_steps
+from identify.trace.beside_chance import beside_the_same_chance
 from identify.trace.claims import against_chance
 from identify.trace.contests import at_the_same_place, in_their_places, reformed
 from identify.trace.exchange import in_each_form, in_other_forms, joins
 from identify.trace.matched import matched
 from identify.trace.scores import scan, stepped
 from identify.trace.sizes import known_sizes
+from identify.trace.spreads import try_scatters
 from identify.trace.stages import slow_flow_starts
 from identify.trace.tried import tried
 from simulated_rig.campaigns import RecordedRun
@@ -325,6 +327,40 @@ def test_another_minimum_is_led_to_its_end(tmp_path: Path) -> None:
     size, second = (found.estimates[n] for n in ("channel_mismatch.gain", "mode2.frequency_hz"))
     assert abs(size.value - 0.01916728328049611) < 4 * size.stderr
     assert abs(second.value - truth) < 4 * second.stderr
+
+
+def test_what_is_likelier_but_for_its_values_is_no_reason_for_the_next(tmp_path: Path) -> None:
+    """The speaker's delay beside a mode whose frequency wanders: the microphones' lag does the same
+    with a corner that none has, and a drive that scatters had been claimed instead (80206)."""
+    rig = random_rig(80206, modes=MOST_TWO)
+    effects = [
+        make_effect("actuator_dynamics/delay", {"delay_s": 1.404534588684349e-05}),
+        make_effect("parameter_drift/frequency_walk", {"frequency_walk": 2.230169909647579e-4}),
+    ]
+    ready = record(tmp_path, 80206, rig, effects, forced=9, validation=3, cold=1, modes=1)
+    base = start.fit_from_data(ready.structure, ready.data)
+    lag = by_key("sensor_dynamics:lowpass")
+    larger = ready.structure.with_effects(lag)
+    law = fit_orbits(larger, ready.data, np.r_[base.theta, lag.to_internal((1.4e-5,))])
+    kinds = {s.key: s for s in SCATTERS}
+    run = InProcess()
+    (likelier,) = try_scatters(larger, ready.data, law, [kinds["parameter_drift:random"]], run)
+    assert "edge of its range" in likelier.implausibility
+    several = by_key("parameter_drift:several")
+    drifting = ready.structure.with_effects(several)
+    drift = fit_orbits(drifting, ready.data, np.r_[base.theta, np.zeros(4)])
+    (claim,) = try_scatters(drifting, ready.data, drift, [kinds["drive_scatter"]], run)
+    assert claim.explains
+    assert likelier.evidence < claim.evidence - 50.0
+    assert trace.claimed([claim], [claim, likelier]) == (claim, [likelier])
+    asked = [by_key(f"actuator_dynamics:{form}") for form in ("pole", "delay", "resonance")]
+    found = beside_the_same_chance(
+        [claim, likelier], ready.data, asked, run, lambda share, text: None
+    )
+    tries = [claim, likelier, *found]
+    best, others = trace.claimed([t for t in tries if t.explains], tries)
+    assert best.key_of_forms == ("actuator_dynamics:delay", "parameter_drift:random")
+    assert not others
 
 
 def test_one_run_alone_is_no_evidence_of_a_cause(tmp_path: Path) -> None:

@@ -20,7 +20,15 @@ from identify.trace.scores import most_promising, scan, score_tests, stepped
 from identify.trace.sizes import known_sizes
 from identify.trace.spreads import try_scatters
 from identify.trace.stages import try_effects
-from identify.trace.tried import Tried, best_by_name, best_form, first_of_each, misfit, tried
+from identify.trace.tried import (
+    EVIDENCE,
+    Tried,
+    best_by_name,
+    best_form,
+    first_of_each,
+    misfit,
+    tried,
+)
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -175,18 +183,33 @@ def beside_the_same_chance(
     run: Executor,
     report: Progress,
 ) -> list[Tried]:
-    """Other effects in the place of the one that explains the data with a spread beside it.
+    """Other effects in the place of the one that explains the data with a spread beside it, and of
+    what is likelier by far, but for values that cannot be true: a law of another place may do the
+    same with some that can (80206, a lag of the microphones for a delay of the speaker).
 
     Only the nearest had a spread tried beside them; which those are, the scattered runs decided.
     """
     good = [t for t in tries if t.explains]
-    best = best_form(good) if good else None
-    if best is None or best.spread is None or len(best.effects) != 2:
-        return []
-    law, chance = best.effects
+    best = [best_form(good)] if good else []
+    least = min((t.evidence for t in best), default=np.inf)
+    better = [t for t in tries if t.but_for_values and t.evidence < least - EVIDENCE]
+    better.sort(key=lambda t: t.evidence)
+    out: list[Tried] = []
+    for t in [*best, *better[:1]]:
+        if t.spread is not None and len(t.effects) == 2:
+            out += _in_the_place_of_its_law(t, data, available, run, report)
+    return [*out, *without_chance(out, data)]
+
+
+def _in_the_place_of_its_law(
+    t: Tried, data: Dataset, available: Sequence[Effect], run: Executor, report: Progress
+) -> list[Tried]:
+    """Other laws than that of `t`, which fit beside the same spread of the same size."""
+    law, chance = t.effects
     assert isinstance(chance, Scatter)
-    wide = best.spread.data
-    base = with_fewer(best, (), wide)
+    assert t.spread is not None
+    wide = t.spread.data
+    base = with_fewer(t, (), wide)
     if not np.isfinite(base.chi2):
         return []
     others = [a for a in available if a.name != law.name]
@@ -195,7 +218,7 @@ def beside_the_same_chance(
         progress=lambda share, text: report(0.95 + 0.05 * share, text),
     )  # fmt: skip
     out: list[Tried] = []
-    for t in best_by_name(found):
-        if t.explains:
-            out += try_scatters(t.fit.structure, data, t.fit, [chance], run)
-    return [*out, *without_chance(out, data)]
+    for o in best_by_name(found):
+        if o.explains:
+            out += try_scatters(o.fit.structure, data, o.fit, [chance], run)
+    return out

@@ -107,11 +107,10 @@ def _stands_for_another(t: Tried, best: Tried) -> bool:
 
 
 def _cannot_be_true(t: Tried, best: Tried) -> bool:
-    """Whether a law of no more effects leaves nothing but noise, with values that cannot be true or
-    that the data do not tell."""
-    return (
-        t.spread is None and t.adequate and not t.plausible and len(t.effects) <= len(best.effects)
-    )
+    """Whether no more effects leave nothing but noise, with values that cannot be true or that the
+    data do not tell; chance beside a law, against such a one alone (80206)."""
+    like = t.spread is None or best.spread is not None
+    return like and t.but_for_values and len(t.effects) <= len(best.effects)
 
 
 def _chance_rivals(spread: Tried, best: Tried) -> bool:

@@ -106,6 +106,11 @@ class Tried:
         return self.adequate and self.plausible and self.leaves_noise
 
     @property
+    def but_for_values(self) -> bool:
+        """Whether it would explain the data, if its values could be true."""
+        return self.adequate and self.leaves_noise and not self.plausible and not self.objection
+
+    @property
     def leaves_noise(self) -> bool:
         """Whether what is left beside a spread, if there is one, is as probable as it must be: a
         law beside it may have been led to where chance is large enough for it (67029, a drift of a
