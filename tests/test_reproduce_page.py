@@ -22,6 +22,7 @@ from identify.effects import by_key
 from identify.fit import fit_orbits
 from identify.identification import prepare
 from identify.report.words import percent, scientific
+from identify.start import reseated
 from identify.structure import Structure
 from simulated_rig.presets import thesis_two_mode
 from tests.report_material import diagnosis
@@ -177,6 +178,30 @@ def test_the_stand_in_lacks_a_speaker_and_an_offset() -> None:
         ("actuator_dynamics.damping", 0.1),
     ):
         assert fit.values[name] == pytest.approx(true[name], rel=tolerance), name
+
+
+def test_an_idle_mode_is_put_where_one_is_missing() -> None:
+    """Those two effects sought at once: the speaker's resonance takes the place of one of the four
+    modes, whose shares vanish, and none is left for that at 526 Hz, which coarse noise hides."""
+    ready = prepare(experiment.recorded().campaign, Structure(mode_count=4))
+    both = by_key("actuator_dynamics:resonance"), by_key("sensor_offset:mode_shapes")
+    larger, highest = ready.structure.with_effects(*both), experiment.stand_in().modes[3]
+    true = material.true_parameters(experiment.stand_in()) | {
+        "actuator_dynamics.frequency_hz": 240.0,
+        "actuator_dynamics.damping": 0.25,
+        "sensor_offset.distance_m": experiment.OFFSET_M,
+        "mode4.frequency_hz": 240.0,
+        "mode4.damping": 0.3,
+        "mode4.flame_residue": 0.0,
+        "mode4.speaker_residue": 0.0,
+    }
+    theta = larger.parameters.to_internal(list_of(true, larger))
+    astray = fit_orbits(larger, ready.data, theta, continuation=(0.003, 0.0))
+    assert astray.chi2_per_dof > 100
+    fit = reseated(astray, ready.data)
+    assert lack_of_fit_p(fit.chi2, fit.dof) > 1e-3
+    assert fit.values["mode4.frequency_hz"] == pytest.approx(highest.frequency_hz, rel=2e-3)
+    assert reseated(fit, ready.data) is fit
 
 
 def list_of(values: dict[str, float], structure: Structure) -> list[float]:

@@ -16,7 +16,7 @@ from identify.dataset import Dataset
 from identify.effect import Effect, Known
 from identify.executor import Executor, Progress
 from identify.fit import Fit, fit_orbits
-from identify.start import CoarseStart, dense_placements, polish, signed_starts
+from identify.start import CoarseStart, dense_placements, polish, reseated, signed_starts
 from identify.structure import Structure
 from identify.trace.restated import canonical, renamed
 from identify.trace.sizes import known_sizes
@@ -186,7 +186,7 @@ def _refit(led: _Led) -> Fit:
     if pair.richer is not None:
         thetas = renamed(pair.effects[0], structure, pair.sought, thetas)
     fit = fit_orbits(structure, pair.data, np.stack(thetas), continuation=(0.003, 0.0))
-    return canonical(fit, pair.data)
+    return canonical(reseated(fit, pair.data), pair.data)
 
 
 def _best(led: Sequence[_Led], count: int) -> list[_Led]:
