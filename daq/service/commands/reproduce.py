@@ -17,7 +17,7 @@ def reproduce(
 ) -> None:
     """Make the thesis's tables and figures again, theirs beside ours, on one page.
 
-    Some minutes of computing, most of them for tracing what the re-enacted experiment lacks.
+    A quarter of an hour of computing, most of it for tracing what the re-enacted experiment lacks.
     """
     from daq.service.reproduce import reproduce as make
 
