@@ -48,10 +48,8 @@ def intervals(fit: Fit, data: Dataset) -> dict[str, Interval]:
     estimates = fit.estimates
     out = {}
     for name, e in estimates.items():
-        low, high = e.interval(Z95)
-        out[name] = Interval(
-            low if e.determined else None, high if e.determined else None, "gaussian"
-        )
+        low, high = e.interval(Z95) if e.determined else (None, None)
+        out[name] = Interval(low, high, "gaussian")
     doubtful = _doubtful(fit, data)
     for j, (low_end, high_end) in _profiled(fit, data, doubtful).items():
         out[fit.structure.parameters.names[j]] = Interval(low_end, high_end, "profile")

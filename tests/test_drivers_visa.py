@@ -48,6 +48,14 @@ def opened(server: ScpiServer, timeout_s: float = 1.0) -> tuple[SteppedOutput, G
     return open_generator(server.address, LIMITS, timeout_s=timeout_s), server.instrument
 
 
+def sounding(server: ScpiServer, timeout_s: float = 1.0) -> tuple[SteppedOutput, Generator]:
+    """The same, driven until it is on."""
+    output, generator = opened(server, timeout_s)
+    output.drive(Tone(170.0, 1.0))
+    assert until(lambda: generator.on)
+    return output, generator
+
+
 def test_every_dialect_sets_reads_back_ramps_and_silences(server: ScpiServer) -> None:
     output, generator = opened(server)
     assert dialect_for(generator.identity).name == generator.maker
@@ -82,9 +90,7 @@ def test_limits_are_asked_from_the_instrument(keysight: ScpiServer) -> None:
 
 
 def test_dead_man_and_emergency_stop(keysight: ScpiServer) -> None:
-    output, generator = opened(keysight)
-    output.drive(Tone(170.0, 1.0))
-    assert until(lambda: generator.on)
+    output, generator = sounding(keysight)
     fed_s = time.monotonic()
     output.feed()
     assert until(lambda: not generator.on)
@@ -122,9 +128,7 @@ def test_a_setting_that_comes_out_different_is_a_fault_and_silence(keysight: Scp
 
 def test_a_lost_off_is_seen_and_told_again(server: ScpiServer) -> None:
     """No error tells of a command that the instrument lost: only its state does."""
-    output, generator = opened(server)
-    output.drive(Tone(170.0, 1.0))
-    assert until(lambda: generator.on)
+    output, generator = sounding(server)
     generator.deaf = 3
     output.silence()
     assert until(lambda: output.fault is not None)
@@ -135,9 +139,7 @@ def test_a_lost_off_is_seen_and_told_again(server: ScpiServer) -> None:
 
 
 def test_closing_tells_until_the_output_is_seen_to_be_off(keysight: ScpiServer) -> None:
-    output, generator = opened(keysight)
-    output.drive(Tone(170.0, 1.0))
-    assert until(lambda: generator.on)
+    output, generator = sounding(keysight)
     generator.deaf = 6
     output.close()
     assert not generator.on
@@ -181,9 +183,7 @@ def test_nobody_there_is_a_lost_device() -> None:
 
 
 def test_a_frozen_generator_is_silenced_when_it_wakes(keysight: ScpiServer) -> None:
-    output, generator = opened(keysight, timeout_s=0.2)
-    output.drive(Tone(170.0, 1.0))
-    assert until(lambda: generator.on)
+    output, generator = sounding(keysight, timeout_s=0.2)
     keysight.hang = True
     output.silence()
     assert until(lambda: output.fault is not None)
