@@ -10,7 +10,6 @@ kept in `fault` for the status and raised at the next `drive`.
 """
 
 import contextlib
-import math
 import threading
 import time
 from dataclasses import replace
@@ -45,8 +44,7 @@ class SteppedOutput:
         self._tolerance = tolerance
         self.guard = OutputGuard(limits, GRAIN_HZ, time.monotonic, 1, synthesise=False)
         self._wake = threading.Event()
-        self._closing = False
-        self._give_up_s = math.inf
+        self._give_up_s: float | None = None  # when, once it is being closed
         self._sent_v = 0.0
         self._certain = True
         self.fault: str | None = None
@@ -120,11 +118,10 @@ class SteppedOutput:
 
     def close(self) -> None:
         """Silence, wait for it, release; harmless twice."""
-        if self._closing:
+        if self._give_up_s is not None:
             return
         self.silence()
         self._give_up_s = time.monotonic() + GIVE_UP_S
-        self._closing = True
         self._wake.set()
         self._thread.join()
         self._device.close()
@@ -142,7 +139,7 @@ class SteppedOutput:
                 last_s = now_s
                 self._send(self.guard.settle(grains).amplitude_v)
             quiet = self._sent_v == 0.0 and self._certain
-            if self._closing and (quiet or time.monotonic() > self._give_up_s):
+            if self._give_up_s is not None and (quiet or time.monotonic() > self._give_up_s):
                 return
 
     def _send(self, amplitude_v: float) -> None:

@@ -6,7 +6,7 @@ one (an inverse level, zero where nothing saturates) too, but the equations are 
 value is its size. Standard errors are carried through by the derivative of that map.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
@@ -95,6 +95,10 @@ class ParameterSet:
     def to_internal(self, values: Sequence[float] | FloatArray) -> FloatArray:
         pairs = zip(self.parameters, values, strict=True)
         return np.array([p.to_internal(float(v)) for p, v in pairs])
+
+    def unknowns(self, values: Mapping[str, float]) -> FloatArray:
+        """The vector of unknowns (p,) of physical values by name, of which there may be others."""
+        return self.to_internal([values[name] for name in self.names])
 
     def to_physical(self, internal: FloatArray) -> FloatArray:
         """Physical values of a vector of unknowns, or of several, (…, p)."""

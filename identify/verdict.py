@@ -127,7 +127,7 @@ def judge(
 
 def _implausible(tried: Sequence[Tried]) -> list[Tried]:
     """Laws that leave no more than noise, with values that cannot be true."""
-    return [t for t in tried if t.spread is None and t.adequate and not t.plausible]
+    return [t for t in tried if t.spread is None and t.but_for_values]
 
 
 def _but_for_values(declared: Declared, tried: Sequence[Tried]) -> str:

@@ -62,7 +62,7 @@ def tube(structure: Structure | None = None, **changed: float) -> FloatArray:
         **changed,
     }
     parameters = (structure or Structure()).parameters
-    return parameters.to_internal([values[n] for n in parameters.names])
+    return parameters.unknowns(values)
 
 
 def steady(structure: Structure, theta: FloatArray) -> list[tuple[float, npt.NDArray]]:

@@ -22,7 +22,7 @@ K = 7
 
 def theta(structure: Structure) -> np.ndarray:
     values = true_values()
-    return structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+    return structure.parameters.unknowns(values)
 
 
 def forced_conditions() -> Conditions:

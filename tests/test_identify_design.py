@@ -38,7 +38,7 @@ def solved(options: tuple[Option, ...], effect: str, value: float) -> list[Harmo
     """What runs would measure on the thesis's rig with an effect of that size, without noise."""
     model, added = structure(effect)
     values = {**true_values(), added.parameters[0].name: value}
-    theta = model.parameters.to_internal([values[n] for n in model.parameters.names])
+    theta = model.parameters.unknowns(values)
     n, total = len(options), K + dataset.EXTRA_HARMONICS
     drive = np.zeros((n, total), dtype=complex)
     drive[:, 0] = [o.amplitude_v or 0.0 for o in options]
@@ -94,7 +94,7 @@ def fitted(effect: str, measured: list[Harmonics], start: Fit | float) -> Fit:
         theta = start.theta
     else:
         values = {**true_values(), added.parameters[0].name: start}
-        theta = model.parameters.to_internal([values[n] for n in model.parameters.names])
+        theta = model.parameters.unknowns(values)
     fit = fit_orbits(model, data, theta, continuation=(0.0,))
     assert fit.converged, fit.reason
     return fit

@@ -43,8 +43,7 @@ def thesis_tube() -> Fit:
         values[f"mode{i + 1}.damping"] = zeta
         values[f"mode{i + 1}.flame_residue"] = 30 * 22.5 * psi_flame[i] * D[i]
         values[f"mode{i + 1}.speaker_residue"] = psi_speaker[i] * D[i]
-    return as_fit(structure, structure.parameters.to_internal(
-        [values[n] for n in structure.parameters.names]))  # fmt: skip
+    return as_fit(structure, structure.parameters.unknowns(values))
 
 
 def test_poles_of_the_thesis_tube() -> None:

@@ -156,7 +156,7 @@ def test_the_stand_in_lacks_a_speaker_and_an_offset() -> None:
     structure = Structure(mode_count=4)
     data = prepare(campaign, structure).data
     true = material.true_parameters(plant)
-    bare = fit_orbits(structure, data, structure.parameters.to_internal(list_of(true, structure)))
+    bare = fit_orbits(structure, data, structure.parameters.unknowns(true))
     assert bare.chi2_per_dof > 100
     larger = structure.with_effects(
         by_key("actuator_dynamics:resonance"), by_key("sensor_offset:mode_shapes")
@@ -166,7 +166,7 @@ def test_the_stand_in_lacks_a_speaker_and_an_offset() -> None:
         "actuator_dynamics.damping": 0.25,
         "sensor_offset.distance_m": experiment.OFFSET_M,
     }
-    fit = fit_orbits(larger, data, larger.parameters.to_internal(list_of(true, larger)))
+    fit = fit_orbits(larger, data, larger.parameters.unknowns(true))
     assert fit.converged
     assert lack_of_fit_p(fit.chi2, fit.dof) > 1e-3
     for name, tolerance in (
@@ -195,17 +195,13 @@ def test_an_idle_mode_is_put_where_one_is_missing() -> None:
         "mode4.flame_residue": 0.0,
         "mode4.speaker_residue": 0.0,
     }
-    theta = larger.parameters.to_internal(list_of(true, larger))
+    theta = larger.parameters.unknowns(true)
     astray = fit_orbits(larger, ready.data, theta, continuation=(0.003, 0.0))
     assert astray.chi2_per_dof > 100
     fit = reseated(astray, ready.data)
     assert lack_of_fit_p(fit.chi2, fit.dof) > 1e-3
     assert fit.values["mode4.frequency_hz"] == pytest.approx(highest.frequency_hz, rel=2e-3)
     assert reseated(fit, ready.data) is fit
-
-
-def list_of(values: dict[str, float], structure: Structure) -> list[float]:
-    return [values[name] for name in structure.parameters.names]
 
 
 def test_tracing_stands_beside_the_search(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -424,7 +424,7 @@ def test_a_side_resonator_is_more_than_one_more_mode(tmp_path: Path) -> None:
     structure = mode.fit.structure
     (other,) = named_otherwise(mode.effects[0], mode)
     assert other["mode2.frequency_hz"] == mode.fit.values["acoustic_mode.frequency_hz"]
-    theta = structure.parameters.to_internal([other[n] for n in structure.parameters.names])
+    theta = structure.parameters.unknowns(other)
     same = fit_orbits(structure, ready.data, theta, continuation=(0.0,), iterations=0)
     assert same.chi2 == pytest.approx(mode.fit.chi2, rel=1e-6)
     renamed = replace(mode, fit=same)
@@ -445,7 +445,7 @@ def test_two_modes_in_one_place_are_one_too_many(tmp_path: Path) -> None:
     for kind, size in split.items():
         p[f"acoustic_mode.{kind}"], p[f"mode2.{kind}"] = -size, p[f"mode2.{kind}"] + size
     larger = ready.structure.with_effects(delay, mode)
-    theta = larger.parameters.to_internal([p[n] for n in larger.parameters.names])
+    theta = larger.parameters.unknowns(p)
     same = fit_orbits(larger, ready.data, theta, continuation=(0.0,), iterations=0)
     both = tried(larger.effects, same, ready.data)
     assert both.adequate

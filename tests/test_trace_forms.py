@@ -425,7 +425,7 @@ def test_a_spread_does_not_hide_a_mode_that_has_strayed(tmp_path: Path) -> None:
     (found,) = try_scatters(ready.structure, ready.data, base, [drive], InProcess())
     assert found.plausible
     values = found.fit.values | {"mode1.damping": 0.2}
-    theta = ready.structure.parameters.to_internal([values[n] for n in found.fit.values])
+    theta = ready.structure.parameters.unknowns(values)
     astray = replace(found, fit=replace(found.fit, theta=theta))
     assert astray.implausibility == "mode1.damping is no mode's (0.2)"
     assert replace(astray, effects=(), spread=None).plausible  # a law need not be at its end there

@@ -292,7 +292,7 @@ def test_of_the_modes_any_may_be_the_one_too_many(tmp_path: Path) -> None:
     larger, v = ready.structure.with_effects(mode), base.values
     values = v | {f"acoustic_mode.{k}": v[f"mode2.{k}"] for k in MODAL}
     values |= dict(zip((f"mode2.{k}" for k in MODAL), (1700.0, 1e-3, 0.1, 0.1), strict=True))
-    theta = larger.parameters.to_internal([values[n] for n in larger.parameters.names])
+    theta = larger.parameters.unknowns(values)
     swapped = tried_as(replace(base, structure=larger, theta=theta), mode.key)
     without = with_fewer(swapped, (), ready.data)
     assert without.chi2 == pytest.approx(base.chi2, rel=1e-3)
@@ -306,7 +306,7 @@ def explaining(key: str, own: dict[str, float], name: str, stderr: float) -> tra
     values = {q.name: 1.0 for q in structure.parameters.parameters}
     values |= {"mode1.damping": 0.01, "mode2.damping": 0.05, "mode1.flame_residue": 30.0}
     values |= {f"{effect.name}.{n}": x for n, x in own.items()}
-    theta = structure.parameters.to_internal([values[n] for n in structure.parameters.names])
+    theta = structure.parameters.unknowns(values)
     covariance = np.zeros((theta.size, theta.size))
     at = structure.parameters.index[name]
     covariance[at, at] = stderr**2

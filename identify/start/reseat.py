@@ -12,6 +12,7 @@ from identify.assess import lack_of_fit_p
 from identify.dataset import Dataset
 from identify.fit import Fit, fit_orbits
 from identify.start.rough import coarse, distinct, polish
+from identify.start.vectors import placed
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -19,7 +20,6 @@ NOISE_P = 1e-3  # chance of leaving so much, above which it may be noise
 IDLE = 9.0  # times what the misfit lets χ² vary: what a mode that does nothing takes away at most
 PLACES = tuple(1.2 * 1.06**j for j in range(22))  # over the free frequency, up to four times it
 APART = 0.05  # of a place from another mode: nearer, the two are one
-DAMPING = 0.03
 PART = 0.1  # of the singing mode's shares in flame and speaker
 FIRST, SECOND = 0.05, 0.01  # shares of each coefficient's size that count as noise, by stage
 LED, KEPT = 24, 4  # starts that are led through these, and that are fitted
@@ -60,7 +60,7 @@ def _idle(fit: Fit) -> int | None:
 def _elsewhere(fit: Fit, idle: int, free_hz: float) -> list[FloatArray]:
     """The fit's values with the idle mode at each place where there is none, with small shares of
     either sign."""
-    values, parameters = fit.values, fit.structure.parameters
+    values = fit.values
     modes = range(1, fit.structure.mode_count + 1)
     others = np.array([values[f"mode{i}.frequency_hz"] for i in modes if i != idle])
     out = []
@@ -69,11 +69,6 @@ def _elsewhere(fit: Fit, idle: int, free_hz: float) -> list[FloatArray]:
             continue
         for flame in (PART, -PART):
             for speaker in (PART, -PART):
-                now = values | {
-                    f"mode{idle}.frequency_hz": frequency,
-                    f"mode{idle}.damping": DAMPING,
-                    f"mode{idle}.flame_residue": flame * values["mode1.flame_residue"],
-                    f"mode{idle}.speaker_residue": speaker * values["mode1.speaker_residue"],
-                }
-                out.append(parameters.to_internal([now[n] for n in parameters.names]))
+                there = placed(values, idle, frequency, flame=flame, speaker=speaker)
+                out.append(fit.structure.parameters.unknowns(values | there))
     return out

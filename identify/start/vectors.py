@@ -4,7 +4,7 @@ Mode 1 sings. The modes that do not are seen at a few harmonics only, so that wh
 which sign the flame's share in them is has to be tried.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 
 import numpy as np
@@ -14,6 +14,8 @@ from identify.fit import Fit
 from identify.structure import Structure
 
 FloatArray = npt.NDArray[np.float64]
+
+DAMPING = 0.03  # of a mode that is placed somewhere
 
 
 def named(structure: Structure, values: dict[str, float], coefficients: list[float]) -> FloatArray:
@@ -27,8 +29,7 @@ def named(structure: Structure, values: dict[str, float], coefficients: list[flo
         excess = [cd * node**d for d, cd in enumerate(coefficients, start=2)]
         values[f"nonlinearity.value{j}"] = node + sum(excess)
     values.setdefault("flame.delay_s", 1e-4)
-    names = structure.parameters.names
-    return structure.parameters.to_internal([values[name] for name in names])
+    return structure.parameters.unknowns(values)
 
 
 def near(structure: Structure, a: FloatArray, b: FloatArray) -> bool:
@@ -71,13 +72,22 @@ def moved(
     for sign in (1.0, -1.0):
         values = near.values
         for i, ratio in enumerate(placement, start=2):
-            values[f"mode{i}.frequency_hz"] = ratio * free_hz
-            values[f"mode{i}.damping"] = 0.03
-            values[f"mode{i}.flame_residue"] = sign * 0.2 * values["mode1.flame_residue"]
-            values[f"mode{i}.speaker_residue"] = 0.05 * values["mode1.speaker_residue"]
-        names = structure.parameters.names
-        out.append(structure.parameters.to_internal([values[n] for n in names]))
+            values |= placed(values, i, ratio * free_hz, flame=sign * 0.2, speaker=0.05)
+        out.append(structure.parameters.unknowns(values))
     return out
+
+
+def placed(
+    values: Mapping[str, float], mode: int, frequency_hz: float, *, flame: float, speaker: float
+) -> dict[str, float]:
+    """Values of a mode at this frequency, hardly damped, its parts in flame and speaker these times
+    the singing mode's."""
+    return {
+        f"mode{mode}.frequency_hz": frequency_hz,
+        f"mode{mode}.damping": DAMPING,
+        f"mode{mode}.flame_residue": flame * values["mode1.flame_residue"],
+        f"mode{mode}.speaker_residue": speaker * values["mode1.speaker_residue"],
+    }
 
 
 def usual_placements(count: int) -> list[tuple[float, ...]]:

@@ -25,10 +25,10 @@ def part_of(
     """The values of `t`, or those given, with some of its effects, not fitted again: as loud as
     with all."""
     structure = replace(t.fit.structure, effects=effects)
-    names, values = structure.parameters.names, values or t.fit.values
+    values = values or t.fit.values
     gone = [e for e in t.effects if e not in effects]
-    theta = structure.parameters.to_internal([values[n] for n in names])
-    theta = louder(theta, names, loudness(data, gone, values))
+    theta = structure.parameters.unknowns(values)
+    theta = louder(theta, structure.parameters.names, loudness(data, gone, values))
     return replace(t.fit, structure=structure, theta=theta)
 
 
@@ -37,13 +37,12 @@ def with_fewer(t: Tried, effects: tuple[Effect, ...], data: Dataset) -> Fit:
     where that ends no nearer. What an effect that stands for nothing leaves is at its minimum
     already, which coarser noise may lead away from."""
     smaller = replace(t.fit.structure, effects=effects)
-    names = smaller.parameters.names
     known = [t.fit.values]
     for e in t.effects:
         if e not in effects:
             known += named_otherwise(e, t)
             known += [p for p in (_merged(e, t, q) for q in known) if p is not None]
-    thetas = np.stack([smaller.parameters.to_internal([p[n] for n in names]) for p in known])
+    thetas = np.stack([smaller.parameters.unknowns(p) for p in known])
     led = fit_orbits(smaller, data, thetas, continuation=(0.003, 0.0))
     if led.chi2 < t.fit.chi2 + NEEDLESS:
         return led

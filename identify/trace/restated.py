@@ -48,7 +48,7 @@ def by_name(effect: Effect, larger: Structure, p: Mapping[str, float]) -> FloatA
     plain = replace(larger, effects=())
     names = [*plain.parameters.names, *(q.name for q in effect.parameters)]
     now = {**p, **dict(zip(names, effect.from_restated(plain, p), strict=True))}
-    return larger.parameters.to_internal([now[n] for n in larger.parameters.names])
+    return larger.parameters.unknowns(now)
 
 
 def renamed(

@@ -259,10 +259,8 @@ def tried(effects: tuple[Effect, ...], fit: Fit, data: Dataset) -> Tried:
 def _foreseen(fit: Fit, data: Dataset) -> tuple[Fit, list[assess.Prediction]]:
     """The fit and what it predicts of the held-out runs; where the fitted runs do not tell between
     several values (`Effect.as_well`), with those that predict best."""
-    parameters = fit.structure.parameters
     equal = [fit.values | now for e in fit.structure.effects for now in e.as_well(fit.values)]
-    rows = [[values[name] for name in parameters.names] for values in equal]
-    fits = [replace(fit, theta=parameters.to_internal(row)) for row in rows]
+    fits = [replace(fit, theta=fit.structure.parameters.unknowns(values)) for values in equal]
     if len(fits) < 2 or not data.validation:
         fits = [fit]
     found = [(f, [assess.predict(f.structure, f.theta, b) for b in data.validation]) for f in fits]
