@@ -14,7 +14,6 @@ time of each process, answers' times, the rate limit and the headroom to it.
 
 import argparse
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -22,10 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import service_load
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
-from benchmarks import service_load
 from daq.acquire import Acquisition
 from daq.records import RunHeader
 from daq.service.jobs import Link

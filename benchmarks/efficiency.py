@@ -57,8 +57,8 @@ TABLE_4_4 = ((166.0, 1.0), (167.0, 1.0), (170.0, 1.5), (171.0, 2.0))  # Hz, 1e10
 def quiet(which: str) -> tuple[RigConfig, Campaign]:
     """The rig, and its campaign without noise."""
     config = build_config("thesis-two-mode")
-    silent = tuple(replace(m, noise_pa=0.0) for m in config.microphones)
-    config = replace(config, microphones=silent, converter=Converter(bits=32))
+    one, other = (replace(m, noise_pa=0.0) for m in config.microphones)
+    config = replace(config, microphones=(one, other), converter=Converter(bits=32))
     if which == "campaign":
         plan = plan_campaign(config, SEED, forced=8, validation=0)
     else:
@@ -197,7 +197,9 @@ def report(which: str, noise_db: float, records: list[Record]) -> None:
           f"{'bias/b':>8s}")  # fmt: skip
     rough = [r["balance"] for r in used if r["balance"] is not None]
     for name, limit in zip(STRUCTURE.parameters.names, limits, strict=True):
-        estimates = [Estimate(*r["estimates"][name], "") for r in used]
+        estimates = [
+            Estimate(value, stderr, "") for value, stderr in (r["estimates"][name] for r in used)
+        ]
         error = np.array([e.value for e in estimates]) - known[name]
         inside = [low <= known[name] <= high for low, high in (e.interval(Z95) for e in estimates)]
         spread = np.sqrt(np.mean([e.stderr**2 for e in estimates])) / limit
@@ -222,7 +224,7 @@ def report(which: str, noise_db: float, records: list[Record]) -> None:
     p = np.array([r["p"] for r in used])
     ratio = np.array([r["chi2"] / r["dof"] for r in used])
     dof = used[0]["dof"]
-    nu = assess.VARIANCE_DOF
+    nu = harmonics.VARIANCE_DOF
     mean = nu / (nu - 2)
     print(f"χ²/dof: mean {ratio.mean():.4f} (expected {mean:.4f}), sd {ratio.std():.4f} "
           f"(χ² of {dof} alone {np.sqrt(2 / dof):.4f}); p < 0.05 in {np.mean(p < 0.05):.1%}, "

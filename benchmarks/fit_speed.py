@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -77,7 +78,7 @@ def data_of(modes: int, runs: int) -> tuple[Structure, FloatArray, Dataset]:
     theta = truth(structure, plant)
     K = COMPARED + dataset.EXTRA_HARMONICS
     at = conditions(plant, runs, K)
-    orbits = balance.solve(structure, theta, at, free=False)
+    orbits = balance.solve(structure, theta, at)
     if not orbits.converged.all():
         raise RuntimeError(f"{modes} modes, {runs} runs: a steady state was not found")
     rng = np.random.default_rng(0)
@@ -111,7 +112,7 @@ def steady_state() -> None:
         drive = np.zeros_like(at.drive)
         drive[:, 0] = -1j * volts
         at = replace(at, omega=np.array([2 * np.pi * frequency]), drive=drive)
-        orbits = balance.solve(structure, theta, at, free=False)
+        orbits = balance.solve(structure, theta, at)
         assert orbits.converged.all()
         return complex(orbits.velocity[0, 0])
 
@@ -143,7 +144,7 @@ def steady_state() -> None:
 
     print("1. one steady state, 166 Hz, 1 V, two modes (relative error of the fundamental, CPU s)")
     for harmonics, tolerance, settle_s in ((3, 1e-5, 1), (5, 1e-7, 2), (9, 1e-9, 3)):
-        ours, began = seconds(lambda h=harmonics: one(h)), time.process_time()
+        ours, began = seconds(partial(one, harmonics)), time.process_time()
         theirs = integrated(tolerance, settle_s)
         spent = time.process_time() - began
         print(f"   balance, {harmonics} harmonics: {abs(one(harmonics) / reference - 1):.1e} in "

@@ -110,7 +110,7 @@ def right_hand_side(plant: Plant) -> Callable[[float, np.ndarray], np.ndarray]:
 
     def f(t: float, x: np.ndarray) -> np.ndarray:
         s = z @ x
-        return a @ x + b * (s * (c1 + s * (c2 + s * c3)))
+        return np.asarray(a @ x + b * (s * (c1 + s * (c2 + s * c3))))
 
     return f
 

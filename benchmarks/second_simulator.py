@@ -234,7 +234,7 @@ def record(tube: Tube, frequency_hz: float, volts: float, rng: np.random.Generat
     half = -0.5 * DENSITY * (MICROPHONES_M[1] - MICROPHONES_M[0]) * _slope(seen)
     pressures: list[FloatArray] = [mean - half, mean + half]
     if tube.upper_microphone is not None:
-        response = tube.upper_microphone(np.fft.rfftfreq(count, H)[1:])
+        response = tube.upper_microphone(np.fft.rfftfreq(count, H)[1:].astype(np.float64))
         spectrum = np.fft.rfft(pressures[1])
         spectrum[1:] *= response
         pressures[1] = np.fft.irfft(spectrum, count)

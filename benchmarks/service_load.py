@@ -40,7 +40,6 @@ def serve(folder: Path, seconds: float, case: str, fit: bool) -> None:
 
     Meanwhile, with `fit`, identifications run one after the other.
     """
-    sys.path.insert(0, str(ROOT))
     from daq.importers import import_folder
     from daq.service import server as serving
     from daq.service.settings import RigSettings, ServerSettings, Settings
@@ -54,7 +53,7 @@ def serve(folder: Path, seconds: float, case: str, fit: bool) -> None:
     job = service.jobs.submit(
         "acquire",
         "8 channels",
-        "benchmarks.acquire_load:acquire",
+        "acquire_load:acquire",
         {"store": str(service.settings.store_dir), "seconds": seconds},
         lane="rig:source",
         about={"rig": "source"},
@@ -205,9 +204,12 @@ async def load(
 def wait_for(address: str) -> None:
     """Until the acquisition runs: its process imports first."""
     while True:
-        jobs = httpx.get(f"{address}/api/v1/jobs").json()["items"]
-        if jobs and jobs[0]["message"] == "acquiring":
+        jobs = httpx.get(f"{address}/api/v1/jobs").json()["items"]  # the newest first
+        (job,) = (job for job in jobs if job["kind"] == "acquire")
+        if job["message"] == "acquiring":
             return
+        if job["error"]:
+            raise RuntimeError(f"the acquisition failed: {job['error']}")
         time.sleep(0.1)
 
 
@@ -246,7 +248,7 @@ def measure(
 ) -> dict[str, Any]:
     """Serve under load and tell what came of it; `alone` leaves out fits and stops.
 
-    Keys: `acquired` (what `benchmarks.acquire_load.acquire` returns), `reads`, `stops` (s),
+    Keys: `acquired` (what `acquire_load.acquire` returns), `reads`, `stops` (s),
     `silent`, `bytes`, `frames`, `dropped`, `gone`, `service_s` and `clients_s` (processor time),
     `held` (memory in MB and open files, every half second).
     """

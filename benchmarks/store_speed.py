@@ -13,6 +13,7 @@ import argparse
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -83,7 +84,7 @@ def main() -> None:
         store = RunStore(Path(root))
         store.catalogue.add_runs(rows)
         for name, (query, after) in PAGES.items():
-            page = best(lambda q=query, a=after: store.runs(q, after=a, limit=100))
+            page = best(partial(store.runs, query, after=after, limit=100))
             print(f"page of 100 of {RUNS}, {name}: {1e3 * page:.2f} ms")
     plain = best(
         lambda: sorted((r for r in rows if r.rig == "rig3"), key=lambda r: r.campaign)[:100]

@@ -25,7 +25,8 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -46,9 +47,8 @@ from identify.trace.spreads import try_scatters
 from simulated_rig import build_config
 from simulated_rig.campaigns import SimulatedCampaign, simulate_campaign
 from simulated_rig.config import RigConfig
-from simulated_rig.effects import EFFECTS
+from simulated_rig.effects import EFFECTS, Effect
 from simulated_rig.random_rigs import MOST_TWO, random_campaign, random_rig
-from simulated_rig.seal import SealedEffect
 
 Truth = dict[str, float]
 TURBULENCE = (-3.0, -1.3)  # decades of volts of drive
@@ -62,6 +62,10 @@ SIZES = (0.5, 0.2, 0.85)  # of `thesis`: in the range from barely visible to gro
 
 def _time(t: Truth) -> float:
     return 1 / (2 * np.pi * t["pole_hz"])
+
+
+def _change(name: str, t: Truth, s: float) -> float:
+    return t[name] * s / 1200
 
 
 RESONANT: dict[str, Callable[[Truth, float], float]] = {
@@ -86,9 +90,7 @@ COMPARED: dict[tuple[str, str, str], dict[str, Callable[[Truth, float], float]]]
     ("actuator_nonlinearity", "cubic", "compression"): {"a3": lambda t, s: -t["cubic_per_v2"]},
     ("channel_mismatch", "skew", "skew"): {"skew_s": lambda t, s: t["skew_s"]},
     **{
-        ("parameter_drift", what, what): {
-            "relative_change": lambda t, s, what=what: t[f"{what}_change"] * s / 1200
-        }
+        ("parameter_drift", what, what): {"relative_change": partial(_change, f"{what}_change")}
         for what in ("frequency", "damping", "flame_gain", "speaker_gain")
     },
 }
@@ -127,7 +129,7 @@ def to_campaign(c: SimulatedCampaign) -> Campaign:
 
 def any_rig(
     mode: str, seed: int, only: str | None
-) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
+) -> tuple[RigConfig, list[Effect], dict[str, int]]:
     """A random rig, one or two effects or none, and how many runs of each kind."""
     rng = np.random.default_rng([seed, 71])
     mode, _, turbulent = mode.partition("-")
@@ -150,7 +152,7 @@ def any_rig(
     return rig, effects, {"forced": forced, "validation": validation, "cold": cold}
 
 
-def thesis_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
+def thesis_rig(seed: int) -> tuple[RigConfig, list[Effect], dict[str, int]]:
     """The thesis's rig in the layout of the recorded campaigns, effect by effect, size by size."""
     keys = sorted(EFFECTS)
     rng = np.random.default_rng([seed, 11])
@@ -159,7 +161,7 @@ def thesis_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]
     return build_config(noise_db=36.0), [effect], {"forced": 7, "validation": 3, "cold": 0}
 
 
-def mixed_rig(seed: int) -> tuple[RigConfig, list[SealedEffect], dict[str, int]]:
+def mixed_rig(seed: int) -> tuple[RigConfig, list[Effect], dict[str, int]]:
     """The thesis's rig with none, one or two effects of any size, more or fewer runs and noise."""
     rng = np.random.default_rng([seed, 13])
     count = int(rng.choice([0, 1, 2], p=[0.1, 0.3, 0.6]))
@@ -454,14 +456,19 @@ def main() -> int:
         done = {r["seed"]: r for r in earlier if same.items() <= r.items()}
     seeds = range(given.first, given.first + given.count)
     tasks = [(given.mode, s, given.only, given.given) for s in seeds if s not in done]
-    with ProcessPoolExecutor(given.jobs) as pool:
-        for i, record in enumerate(pool.map(one, tasks)):
-            done[record["seed"]] = record | same
+    pool = ProcessPoolExecutor(given.jobs)
+    try:
+        # as they end: a long one does not keep the lines of others from the file
+        for i, ended in enumerate(as_completed([pool.submit(one, task) for task in tasks])):
+            record = ended.result() | same
+            done[record["seed"]] = record
             if given.out:
                 with given.out.open("a", encoding="utf-8") as file:
-                    file.write(json.dumps(record | same) + "\n")
+                    file.write(json.dumps(record) + "\n")
             if sys.stderr.isatty() or (i + 1) % 20 == 0:
                 print(f"{i + 1}/{len(tasks)}", file=sys.stderr)
+    finally:
+        pool.shutdown(cancel_futures=True)
     report([done[seed] for seed in seeds])
     return 0
 
