@@ -10,11 +10,12 @@ import pytest
 
 from identify.export import summary_text
 from identify.parameters import Estimate
+from identify.profile import Interval
 from identify.report import figures, html, save_figures, write_html
 from identify.report.compared import harmonics_figure
 from identify.report.misfit import heat_map, in_noise_units
 from identify.report.theme import INK, power_of_ten, to_svg
-from identify.report.words import percent, scientific, with_error
+from identify.report.words import interval, percent, scientific, with_error
 from identify.results import Diagnosis, Identification, QualityFlag, TracedEffect
 from tests import report_material as material
 
@@ -323,6 +324,21 @@ def test_values_have_the_digits_their_error_justifies(
     value: float, stderr: float, expected: tuple[str, str]
 ) -> None:
     assert with_error(Estimate(value, stderr, "1")) == expected
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "expected"),
+    [
+        (168.78921, 168.80604, "168.7892 … 168.8060 Hz"),  # four digits would make both ends one
+        (None, 168.80604, "not bounded … 168.8060 Hz"),
+        (-3.7721e-4, 2.1e-5, "−0.00038 … 0.00002 Hz"),
+    ],
+)
+def test_an_intervals_ends_differ_as_printed(
+    lower: float | None, upper: float, expected: str
+) -> None:
+    shown = interval(Interval(lower, upper, "profile"), Estimate(168.8, 0.0043, "Hz"))
+    assert shown == expected
 
 
 def test_powers_of_ten_are_plain() -> None:

@@ -208,12 +208,12 @@ def interval_notes(result: Result) -> list[str]:
     """Parameters whose 95 % interval is not value ± 1.96 s.e."""
     if not isinstance(result, Identification):
         return []
-    units = {n: words.unit(e.unit) for n, e in result.assessment.parameters.items()}
-    out = []
-    for name, i in result.intervals.items():
-        if i.method == "profile":
-            ends = ["not bounded" if x is None else scientific(x, 4) for x in (i.lower, i.upper)]
-            out.append(f"{name}: {ends[0]} … {ends[1]} {units[name]}".rstrip())
+    estimates = result.assessment.parameters
+    out = [
+        f"{name}: {words.interval(i, estimates[name])}"
+        for name, i in result.intervals.items()
+        if i.method == "profile"
+    ]
     if not out:
         return []
     return [

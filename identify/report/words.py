@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from identify.parameters import Estimate
+from identify.profile import Z95, Interval
 from identify.results import Assessment, Candidate, Diagnosis, Identification, TracedEffect
 
 VERDICTS = {
@@ -98,6 +99,18 @@ def with_error(e: Estimate) -> tuple[str, str]:
 def estimate(e: Estimate) -> str:
     value, error = with_error(e)
     return f"{value} ± {error} {unit(e.unit)}".rstrip()
+
+
+def interval(i: Interval, e: Estimate) -> str:
+    """Both ends, to the digits that its width justifies."""
+    stderr = e.stderr
+    if i.lower is not None and i.upper is not None:
+        stderr = (i.upper - i.lower) / (2 * Z95)
+    low, high = (
+        "not bounded" if end is None else with_error(Estimate(end, stderr, e.unit))[0]
+        for end in (i.lower, i.upper)
+    )
+    return f"{low} … {high} {unit(e.unit)}".rstrip()
 
 
 def listed(parts: Mapping[str, Estimate]) -> str:
