@@ -1,5 +1,6 @@
 """`entrain close-loop`: campaign, diagnosis, next experiment, and again, in this terminal."""
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -145,6 +146,11 @@ def close_loop(
 
 def show_rounds(closed: "Closed") -> None:
     """Print what each round came to, and how the loop ended."""
+    from identify.report.words import percent
+
+    def share(error: float | None) -> str:
+        return percent(math.nan if error is None else error)
+
     table(
         f"closed loop {closed.name}",
         ("#", "verdict", "found, or rivals", "χ²/dof", "validation error", "runs", "rig min"),
@@ -154,8 +160,8 @@ def show_rounds(closed: "Closed") -> None:
                 r.verdict,
                 " + ".join(r.effects) if r.verdict == "traced" else " or ".join(r.rivals),
                 f"{number(r.before.chi2_per_dof, 3)} → {number(r.after.chi2_per_dof, 3)}",
-                f"{number(r.before.validation_error, 3)} → {number(r.after.validation_error, 3)}"
-                f" (floor {number(r.noise_floor, 2)})",
+                f"{share(r.before.validation_error)} → {share(r.after.validation_error)}"
+                f" (floor {share(r.noise_floor)})",
                 r.runs,
                 f"{r.rig_seconds / 60:.1f}",
             )
