@@ -25,6 +25,7 @@ from identify.chances import chi2_tail
 from identify.harmonics import harmonic_under
 from identify.quality.entrainment import FreeLine
 from identify.quality.findings import finding
+from identify.quality.growth import growth
 from identify.quality.lines import Lines, Peak, crest, lines, peaks
 from identify.quality.spectrum import tail
 from identify.quality.view import View
@@ -372,4 +373,13 @@ def line_flag(sighting: Sighting, frequency_hz: float, consistent: bool) -> Qual
     if mains is not None:
         remedy = f"; {mains[0]} × {mains[1]:g} Hz: look for a ground loop"
         return finding(view.name, "mains_hum", "noted", text + remedy)
+    own_rate = growth(view, i, frequency_hz)
+    if not consistent and own_rate.significant:
+        does, remedy = (
+            ("grows", "begins to sing beside the forcing; lower the drive or force elsewhere")
+            if own_rate.rate > 0
+            else ("dies away", "still rings; wait longer before recording")
+        )
+        text += f"; it {does} at {abs(own_rate.rate):.2g} ± {own_rate.stderr:.1g} 1/s: a mode that "
+        return finding(view.name, "another_oscillation", "noted", text + remedy)
     return finding(view.name, "foreign_tone", "noted", text + "; look for its source")
