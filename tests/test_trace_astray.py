@@ -768,3 +768,29 @@ def test_what_a_law_extends_is_claimed_unless_the_extension_is_asked_for(
     both = [delay, distributed]
     assert trace.best_form(both) is distributed
     assert trace.claimed(both, both) == ((distributed, [delay]) if asked_for else (delay, []))
+
+
+def test_a_notch_far_from_what_is_driven_is_known_by_its_strength(tmp_path: Path) -> None:
+    """Runs far below a notch tell neither its width nor its depth but their product: fitted by its
+    depth, it slid down that valley to where no notch is (the second simulator's pairs, 7001), and
+    the search went on for minutes to end at `unexplained`."""
+    hz, zeta, strength = 285.0, 0.055, -0.02
+
+    def before_the_notch(run: RecordedRun) -> RecordedRun:
+        """With the drive that, played through the notch, would have made this recording."""
+        f = run.plan.frequency_hz
+        if run.plan.kind != "forced" or f is None:
+            return run
+        s, w = 2j * np.pi * f, 2 * np.pi * hz
+        notch = 1 + 2 * strength * w * s / (s**2 + 2 * zeta * w * s + w**2)
+        turn = np.exp(s * np.arange(run.drive.size) / 10_000.0)
+        tone = 2 * np.mean(run.drive * turn.conj())
+        return replace(run, drive=run.drive + ((tone / notch - tone) * turn).real)
+
+    ready = altered_campaign(tmp_path, 3, before_the_notch)
+    base = start.fit_from_data(ready.structure, ready.data)
+    assert base.chi2_per_dof > 10
+    found = only(ready, base, "actuator_dynamics:peak")
+    assert found.explains, found.implausibility
+    own = found.estimates["actuator_dynamics.strength"]
+    assert abs(own.value - strength) < 3 * own.stderr < 0.5 * abs(strength)

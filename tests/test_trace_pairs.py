@@ -330,6 +330,19 @@ def test_without_the_flame_s_part_nothing_sings() -> None:
     )
 
 
+def test_what_only_the_speaker_drives_is_no_mode() -> None:
+    """Two notches of a speaker were claimed as one and a mode that the flame has no part in: a
+    place where nothing is."""
+    assert a_further_mode("acoustic_mode.flame_residue", 0.5).plausible
+    driven = a_further_mode("acoustic_mode.flame_residue", 2.0)
+    assert not driven.plausible
+    assert driven.implausibility.startswith(
+        "acoustic_mode.flame_residue is within its own error of nothing, and what only the speaker "
+    )
+    # where the speaker's part is no better known, the two together may be certain
+    assert a_further_mode("acoustic_mode.speaker_residue", 2.0).plausible
+
+
 def test_what_nobody_knows_has_been_stopped_by_nothing() -> None:
     """A damping at the edge of its range is told from one inside, or else is no objection."""
     lowest = by_key("acoustic_mode:mode").parameters[1].lower

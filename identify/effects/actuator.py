@@ -106,24 +106,27 @@ class LaggingResonance(Effect):
 
 class SpeakerPeak(Effect):
     """A peak or a notch that the speaker's enclosure adds to an even response:
-    (s² + 2ζ(1 + g)ωs + ω²)/(s² + 2ζωs + ω²), 1 + g the response at ω."""
+    (s² + 2(ζ + g)ωs + ω²)/(s² + 2ζωs + ω²), 1 + g/ζ the response at ω.
+
+    Runs far from ω tell g alone: neither ζ nor how high the peak is.
+    """
 
     name, location, form = "actuator_dynamics", "actuator", "peak"
     parameters = (
-        Parameter("actuator_dynamics.peak", "1", -1.0, 50.0, scale=1e-2),
+        Parameter("actuator_dynamics.strength", "1", -5.0, 10.0, scale=1e-2),
         *SpeakerResonance.parameters,
     )
-    located = ("actuator_dynamics.peak", *SpeakerResonance.located)
+    located = ("actuator_dynamics.strength", *SpeakerResonance.located)
 
     def starts(self, known: Known) -> list[tuple[float, ...]]:
         sizes = (0.5, -0.5)
-        return [(size, f, z) for size in sizes for _, f, z in self.shapes(known)]
+        return [(size * z, f, z) for size in sizes for _, f, z in self.shapes(known)]
 
     def starts_from(self, other: Effect, values: Mapping[str, float]) -> list[tuple[float, ...]]:
         if other.form != "resonance":
             return []
         f, z = (values[q.name] for q in other.parameters)
-        return [(0.5, f, z), (-0.5, f, z)]
+        return [(0.5 * z, f, z), (-0.5 * z, f, z)]
 
     def shapes(self, known: Known) -> list[tuple[float, ...]]:
         places = (0.7, 0.95, 1.05, 1.4, 1.9, 2.1, 2.7, 3.1)
@@ -131,9 +134,8 @@ class SpeakerPeak(Effect):
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
         w = 2 * np.pi * p["actuator_dynamics.frequency_hz"]
-        lost = 2.0 * p["actuator_dynamics.damping"] * w * s
-        even = s * s + w * w
-        return (even + lost * (p["actuator_dynamics.peak"] + 1.0)) / (even + lost)
+        own = s * s + 2.0 * p["actuator_dynamics.damping"] * w * s + w * w
+        return 1.0 + s * (2.0 * w * p["actuator_dynamics.strength"]) / own
 
 
 class ActuatorDelay(Effect):

@@ -33,6 +33,7 @@ class AcousticMode(Effect):
             q for i in range(1, more + 1) for q in _mode_parameters("" if i == 1 else str(i))
         )
         self.located = tuple(q.name for q in self.parameters if q.unit == "Hz")
+        self.residues = tuple((self.of(i)[2].name, self.of(i)[3].name) for i in range(more))
         # two that are overdamped follow whatever is smooth: an echo was claimed as such
         dampings = tuple(q.name for q in self.parameters if ".damping" in q.name)
         self.modal = dampings if more > 1 else ()

@@ -38,6 +38,7 @@ DECADE_WIDTH = float(DECADES * np.log(10.0) / np.sqrt(2 * np.pi))  # … as ln o
 TINY = 1e-9  # of a number's scale: no smaller size is told apart
 LUCK = 1e-4  # chance below which what speaks against an unrivalled spread is no luck
 BEATEN = "a law does better"  # the objection to a spread that is no reproach to its randomness
+SEEN = 3.0  # standard errors from nothing of a mode's part that is certainly there
 LOST = 1e6  # times its value: a standard error that says nothing of it
 PREFERENCE = 6.0  # what a form without a law must gain on one of the same effect with a law
 USUAL = 3.0  # what a form must gain on one of the same effect that stands before it: more usual
@@ -216,12 +217,22 @@ class Tried:
         dampings = (f"mode{i}.damping" for i in range(1, self.fit.structure.mode_count + 1))
         overdamped = [n for n in dampings if not values[n] < most]
         overdamped += [n for e in self.effects for n in e.modal if not values[n] < OVERDAMPED]
+        # what the speaker drives and the flame does not may as well lie before the speaker's sound
+        # (two notches of an enclosure were claimed as one, and a mode)
+        pairs = (pair for e in self.effects for pair in e.residues)
+        driven = (
+            flame
+            for flame, speaker in pairs
+            if known[flame].stderr > abs(values[flame])
+            and abs(values[speaker]) > SEEN * known[speaker].stderr
+        )
         lost = (n for n in open_ if LOST * values[n] < known[n].stderr < np.inf)
         for names, what in (
             (outside, "at the edge of its range"),
             (lost, "not known by any order of magnitude"),
             (unseen, "within its own error of nothing"),
             (overdamped, "no mode's"),
+            (driven, "within its own error of nothing, and what only the speaker drives no mode"),
         ):
             name = next(iter(names), None)
             if name is not None:
