@@ -143,7 +143,7 @@ class Effect:
     mode_count: int | None = None  # only for declared models of that many modes
     modal: tuple[str, ...] = ()  # damping ratios that must be a mode's: with more, it is a shape
     located: tuple[str, ...] = ()  # parameters known to within their size, or it is not seen at all
-    residues: tuple[tuple[str, str], ...] = ()  # a mode's flame's and speaker's parts, to be in both
+    residues: tuple[tuple[str, str], ...] = ()  # of a mode, the flame's part and the speaker's
     refines: bool = False  # tried only from where another form of it has come without explaining
     empirical: bool = False  # numbers that stand for a law: a form with the law is preferred
     rails: bool = False  # an `amplifier` that ends at its supply: what bends besides comes before
