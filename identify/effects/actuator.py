@@ -10,7 +10,8 @@ import numpy.typing as npt
 from identify import dual
 from identify.effect import Conditions, Effect, Known
 from identify.parameters import Parameter
-from identify.pieces import Bent, Values
+from identify.pieces import Bent, Mode, Values
+from identify.structure import resonance
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -133,9 +134,8 @@ class SpeakerPeak(Effect):
         return [(0.0, q * known.free_hz, z) for q in places for z in (0.05, 0.2)]
 
     def actuator(self, p: Values, at: Conditions, s: Any) -> Any:
-        w = 2 * np.pi * p["actuator_dynamics.frequency_hz"]
-        own = s * s + 2.0 * p["actuator_dynamics.damping"] * w * s + w * w
-        return 1.0 + s * (2.0 * w * p["actuator_dynamics.strength"]) / own
+        strength, f, zeta = (p[q.name] for q in self.parameters)
+        return resonance(Mode(f, zeta, 0.0, 0.0), s) * (4 * np.pi * f * strength) + 1.0
 
 
 class ActuatorDelay(Effect):

@@ -361,25 +361,23 @@ def mains_order(frequency_hz: float, tolerance_hz: float) -> tuple[int, float] |
 
 def line_flag(sighting: Sighting, frequency_hz: float, consistent: bool) -> QualityFlag:
     view = sighting.view
-    own = np.abs(view.spectrum[:, sighting.bin])
-    i = int(np.argmax(own / np.maximum(view.level, 1e-300)))
+    size = np.abs(view.spectrum[:, sighting.bin])
+    i = int(np.argmax(size / np.maximum(view.level, 1e-300)))
     mains = mains_order(frequency_hz, 0.5 * view.bin_hz)
     text = (
-        f"line at {frequency_hz:.2f} Hz, {own[i]:.3g} {view.run.signals[view.inputs[i]].unit} in "
-        f"{view.inputs[i]} ({own[i] / view.level[i]:.1e} of the fundamental, "
+        f"line at {frequency_hz:.2f} Hz, {size[i]:.3g} {view.run.signals[view.inputs[i]].unit} in "
+        f"{view.inputs[i]} ({size[i] / view.level[i]:.1e} of the fundamental, "
         f"{10 * np.log10(sighting.ratio):.0f} dB above the noise), "
         + ("in most runs that can show it" if consistent else "in this run alone")
     )
     if mains is not None:
         remedy = f"; {mains[0]} × {mains[1]:g} Hz: look for a ground loop"
         return finding(view.name, "mains_hum", "noted", text + remedy)
-    own_rate = growth(view, i, frequency_hz)
-    if not consistent and own_rate.significant:
-        does, remedy = (
-            ("grows", "begins to sing beside the forcing; lower the drive or force elsewhere")
-            if own_rate.rate > 0
-            else ("dies away", "still rings; wait longer before recording")
-        )
-        text += f"; it {does} at {abs(own_rate.rate):.2g} ± {own_rate.stderr:.1g} 1/s: a mode that "
-        return finding(view.name, "another_oscillation", "noted", text + remedy)
+    if not consistent and (own := growth(view, i, frequency_hz)).significant:
+        does, what = "dies away", "still rings; wait longer before recording"
+        if own.rate > 0:
+            does = "grows"
+            what = "begins to sing beside the forcing; lower the drive or force elsewhere"
+        text += f"; it {does} at {abs(own.rate):.2g} ± {own.stderr:.1g} 1/s: a mode that {what}"
+        return finding(view.name, "another_oscillation", "noted", text)
     return finding(view.name, "foreign_tone", "noted", text + "; look for its source")

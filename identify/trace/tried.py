@@ -219,10 +219,10 @@ class Tried:
         overdamped += [n for e in self.effects for n in e.modal if not values[n] < OVERDAMPED]
         # what the speaker drives and the flame does not may as well lie before the speaker's sound
         # (two notches of an enclosure were claimed as one, and a mode)
-        pairs = (pair for e in self.effects for pair in e.residues)
         driven = (
             flame
-            for flame, speaker in pairs
+            for e in self.effects
+            for flame, speaker in e.residues
             if known[flame].stderr > abs(values[flame])
             and abs(values[speaker]) > SEEN * known[speaker].stderr
         )
