@@ -154,9 +154,9 @@ def _lead(pair: _Pair) -> _Led:
     else:
         starts = signed_starts(sought, rough, pair.proposals, pair.placements)
         many = SIDE_BY_SIDE
-    # most of them fall behind at once
-    ahead = polish(sought, rough, starts[:many], (FIRST,), 2)[: max(6, many // 4)]
-    return _Led(pair, tuple(polish(sought, rough, ahead, (FIRST,), 4)[:3]))
+    # most of them fall behind at once, but a valley may be long
+    ahead = polish(sought, rough, starts[:many], (FIRST,), 4)[: max(8, many // 4)]
+    return _Led(pair, tuple(polish(sought, rough, ahead, (FIRST,), 10)[:3]))
 
 
 def _anywhere(pair: _Pair) -> list[CoarseStart]:
@@ -175,7 +175,7 @@ def _anywhere(pair: _Pair) -> list[CoarseStart]:
 
 def _lead_on(led: _Led) -> _Led:
     pair = led.pair
-    starts = polish(pair.sought, pair.rough, led.starts, (SECOND,), 10)
+    starts = polish(pair.sought, pair.rough, led.starts, (SECOND,), 20)
     return _Led(pair, tuple(starts[:2]))
 
 
