@@ -1,12 +1,13 @@
 """Verdicts on broadband records of oscillators that lack something, by what is known of the noise.
 
-    python benchmarks/broadband_study.py [--count 3] [--declared linear] [--jobs 2]
+    python benchmarks/broadband_study.py [--count 3] [--declared linear] [--jobs 2] [--sweep]
 
-An oscillator under a random-phase multisine is integrated by an own fine-stepped scheme, one effect
-added to it: some that the candidates name, some that they do not. The linear oscillator is declared
-and the record diagnosed with the noise unknown, with the excitation repeated, and with a quiet
-stretch at its end. Prints one line each: verdict, what is claimed, and whether that is right, wrong
-or open; at the end, the counts. A wrong claim is worse than «unexplained».
+An oscillator under a random-phase multisine, or a sweep up and down, is integrated by an own
+fine-stepped scheme, one effect added to it: some that the candidates name, some that they do not.
+The linear oscillator is declared and the record diagnosed with the noise unknown, with the
+excitation repeated, and with a quiet stretch at its end. Prints one line each: verdict, what is
+claimed, and whether that is right, wrong or open; at the end, the counts. A wrong claim is worse
+than «unexplained».
 """
 
 import argparse
@@ -86,9 +87,10 @@ def _simulate(drive, w0, zeta, kind, size, h):  # type: ignore[no-untyped-def]
 
 
 def record(
-    kind: str, seed: int, periods: int, repeated: bool, quiet: bool
+    kind: str, seed: int, periods: int, repeated: bool, quiet: bool, sweep: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Input and noisy output (samples,) of `periods` multisines: a linear output of size one."""
+    """Input and noisy output (samples,) of `periods` multisines, or of as long a sweep up and down
+    (or of one a period, `repeated`): a linear output of size one."""
     rng = np.random.default_rng(seed)
     lines = np.arange(20, PERIOD * 3 // 10)
 
@@ -98,8 +100,16 @@ def record(
         u = np.fft.irfft(spectrum, PERIOD)
         return np.asarray(u / u.std())
 
+    def swept(samples: int) -> FloatArray:
+        share = np.arange(samples) / samples
+        hz = 10.0 + 140.0 * (1 - np.abs(2 * share - 1))
+        return np.asarray(np.sqrt(2) * np.sin(2 * np.pi * np.cumsum(hz) / RATE))
+
     one = multisine()
-    parts = [one if repeated else multisine() for _ in range(periods)]
+    if sweep:
+        parts = [swept(PERIOD)] * periods if repeated else [swept(periods * PERIOD)]
+    else:
+        parts = [one if repeated else multisine() for _ in range(periods)]
     if quiet:
         parts.append(1e-4 * one)
     u = np.concatenate(parts)
@@ -132,10 +142,10 @@ def record(
     return u, y + noise * rng.standard_normal(y.size)
 
 
-def diagnosed(task: tuple[str, int, str, str]) -> tuple[str, int, str, BroadbandDiagnosis]:
-    kind, seed, noise, declared = task
+def diagnosed(task: tuple[str, int, str, str, bool]) -> tuple[str, int, str, BroadbandDiagnosis]:
+    kind, seed, noise, declared, sweep = task
     repeated, quiet = noise == "repeated", noise == "quiet stretch"
-    u, y = record(kind, seed, 5, repeated, quiet)
+    u, y = record(kind, seed, 5, repeated, quiet, sweep)
     found = diagnose_broadband(
         u, y, RATE,
         declared=declared,  # type: ignore[arg-type]
@@ -168,10 +178,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--declared", default="linear")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--sweep", action="store_true", help="a sweep in place of a multisine")
     parser.add_argument("--kinds", nargs="*", default=KINDS)
     given = parser.parse_args()
     tasks = [
-        (kind, seed, noise, given.declared)
+        (kind, seed, noise, given.declared, given.sweep)
         for kind in given.kinds
         for seed in range(given.first, given.first + given.count)
         for noise in NOISES

@@ -97,3 +97,41 @@ def test_a_sound_recording_has_no_flags(cubic: float) -> None:
     assert _diagnosed(u, y).quality == ()
     kinds = ["cubic"] if cubic else []
     assert [w.score.candidate.kind for w in _diagnosed(u, _hum(y)).claims] == kinds
+
+
+def _sweep(samples: int, times: int) -> FloatArray:
+    """Up from 30 to 130 Hz and down again, so many times."""
+    up = np.linspace(0.0, 1.0, samples // (2 * times), endpoint=False)
+    hz = np.tile(30.0 + 100.0 * np.r_[up, 1.0 - up], times)
+    return np.asarray(0.02 * np.sin(2 * np.pi * np.cumsum(hz) / RATE))
+
+
+def _flagged(lost: int, cubic: float, times: int = 2) -> tuple[list[str], list[str], str]:
+    """What excludes such a sweep, what is claimed of it, and the verdict."""
+    u = _sweep(4 * PERIOD, times)
+    y = duffing_output(u, cubic=cubic)
+    y = y + 3e-4 * np.random.default_rng(8).standard_normal(y.size)
+    y = np.r_[y[:3000], y[3000 + lost :], y[:lost]]
+    found = diagnose_broadband(
+        u, y, RATE, declared="linear", title="one",
+        estimation=slice(300, 3 * PERIOD), test=slice(3 * PERIOD, 4 * PERIOD),
+    )  # fmt: skip
+    excluded = [q.flag for q in found.quality if q.severity == "excluded"]
+    return excluded, [w.score.candidate.kind for w in found.claims], found.verdict
+
+
+@pytest.mark.parametrize(("cubic", "times"), [(12.0, 2), (12.0, 1), (24.0, 1)])
+def test_a_sweep_past_a_bent_resonance_has_lost_no_samples(cubic: float, times: int) -> None:
+    assert _flagged(0, cubic, times) == ([], ["cubic"], "traced")
+
+
+@pytest.mark.parametrize("cubic", [6.0, 12.0])
+def test_a_sweep_of_which_a_sample_is_lost(cubic: float) -> None:
+    assert _flagged(1, cubic) == (["dropped_samples"], [], "unexplained")
+
+
+def test_a_record_that_no_model_follows_is_not_explained() -> None:
+    """The linear oscillator had ended where it says nothing of the response, and what it leaves
+    did not follow such a motion: no discrepancy. It is started from elsewhere too."""
+    *_, verdict = _flagged(3, 6.0)
+    assert verdict == "unexplained"

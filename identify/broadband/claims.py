@@ -3,7 +3,8 @@
 A term may lower the residual and yet not be its cause: beside an effect that no candidate names,
 every flexible term takes up a part. So each is left out again. It accounts for its part where
 without it three times as much exceeds the noise, and it is the cause where no candidate of another
-name does as well in its place. What does not account is dropped, and reported as tried only.
+name does as well in its place. What does not account is dropped, and reported as tried only; so are
+all where together they leave more than a third of what exceeds the noise without them.
 """
 
 from collections.abc import Sequence
@@ -137,10 +138,11 @@ def weigh(
         noise = Noise(best.residual[estimation], UNPREDICTED)
     judge = _Judge(record, declared, estimation, noise)
     weighed = [Weighed(s.score, judge.ratio(s.before, s.after)) for s in steps]
+    most = [w.accounts for w in weighed]  # of what was left when it came
     kept = list(range(len(steps)))
     while True:
         for i in kept:
-            if not weighed[i].accounts:
+            if not most[i]:
                 fewer = judge.with_only(best, [steps[o].score for o in kept if o != i])
                 # a fit of fewer terms yet may have come further down
                 found = [fewer, *(s.before for s in steps if _within(s.before, fewer))]
@@ -149,8 +151,12 @@ def weigh(
         strong = [i for i in kept if weighed[i].accounts]
         if strong == kept:
             break
-        kept = strong
+        kept = strong  # … which leave more without the others, and are weighed again
         best = judge.with_only(best, [steps[i].score for i in kept]) if kept else declared
+    together = judge.ratio(declared, best)
+    if kept and together <= ACCOUNTS:
+        weighed = [replace(w, without=min(w.without, together)) for w in weighed]
+        kept, best = [], declared
     for i in kept:
         others = [steps[o].score for o in kept if o != i]
         weighed[i] = replace(weighed[i], rivals=judge.rivals(steps[i], others, best))

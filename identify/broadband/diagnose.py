@@ -38,7 +38,10 @@ _DECLARED: dict[str, tuple[str, ...]] = {
     "cubic": (*LINEAR, "cubic"),
     "cubic_quadratic": (*LINEAR, "cubic", "quadratic"),
 }
-_STARTS = {"stiffness": -1.0, "damping": -0.1}
+#: Where the linear oscillator is started from: (ω₀ over the frequency of the largest response)²
+#: and damping; from all where the first leaves more than `MUCH` of the response's power.
+_STARTS = ((1.0, 0.1), (0.6, 0.1), (1.6, 0.1), (1.0, 0.02), (1.0, 0.5))
+MUCH = 0.25
 
 
 @dataclass(frozen=True)
@@ -204,9 +207,7 @@ def diagnose_broadband(
     estimation, test = _checked(record, estimation, test, lines, noise)
     plain = Whitener.plain(estimation)
     tell(0.0, "fitting the declared model")
-    start = {name: _STARTS.get(name, 0.0) for name in LINEAR}
-    start["input"] = record.scale.input / record.scale.output
-    linear = fit(record, Structure(LINEAR), start, plain)
+    linear = _linear(record, plain)
     structure = Structure(_DECLARED[declared])
     current = _refit(record, linear, structure, {}, plain)
     record, current = _resolved(record, current, plain)
@@ -287,6 +288,20 @@ def _checked(
                 f"the {record.samples} samples recorded"
             )
     return first, second
+
+
+def _linear(record: Excitation, plain: Whitener) -> Fit:
+    """The linear oscillator, from wherever it leaves least."""
+    structure, y = Structure(LINEAR), plain(record.y - record.y.mean())
+    fits: list[Fit] = []
+    for stiffness, damping in _STARTS:
+        start = {"stiffness": -stiffness, "damping": -damping, "input": 1.0, "bias": 0.0}
+        one = plain(record.predict(structure, np.array([start[n] for n in LINEAR]))[0])
+        start["input"] = float(one @ y) / float(one @ one)  # of its sign
+        fits.append(fit(record, structure, start, plain))
+        if min(f.chi2 for f in fits) < MUCH * float(y @ y):
+            break
+    return min(fits, key=lambda f: f.chi2)
 
 
 def _resolved(record: Excitation, fitted: Fit, plain: Whitener) -> tuple[Excitation, Fit]:

@@ -35,6 +35,7 @@ PURE = 8.0  # power of a tone's main lobe over that of the bins beside it
 MOST = 5  # tones that are named
 LAGS = 12  # samples by which one channel may have slipped
 SIDE = 3  # stretches on either side of a slip
+FAR_LESS = 0.5  # of what the declared model leaves, RMS
 WEAK = 0.02  # share of the response's power that the drive must account for
 
 
@@ -47,7 +48,7 @@ def quality(
         *_clipped(record, declared, name),
         *_repeated(record, declared, lines, name),
         *_held(record, declared, name),
-        *_lost(record, declared, estimation, name),
+        *_lost(record, _standing(declared, best, estimation), estimation, name),
         *_tones(record, residual[estimation], name),
         *_weak(record, best, estimation, name),
         *_uneven(record, residual, estimation, name),
@@ -111,21 +112,29 @@ def _held(record: Excitation, declared: Fit, name: str) -> list[QualityFlag]:
     return [finding(name, "repeated_samples", severity, detail)]
 
 
-def _lost(record: Excitation, declared: Fit, estimation: slice, name: str) -> list[QualityFlag]:
-    """A step of the response's lag behind the declared model's, stretch by stretch: samples of one
-    channel were lost, or inserted."""
-    y, model = record.y[estimation], declared.prediction[estimation]
+def _standing(declared: Fit, best: Fit, estimation: slice) -> Fit:
+    """The richest model where it leaves far less than the declared one does: past a resonance that
+    bends, a linear model is ahead of a sweep by samples. Else what it adds may have gone astray."""
+    left = (np.linalg.norm(f.residual[estimation]) for f in (best, declared))
+    return best if next(left) < FAR_LESS * next(left) else declared
+
+
+def _lost(record: Excitation, fitted: Fit, estimation: slice, name: str) -> list[QualityFlag]:
+    """A step of the response's lag behind the model's, stretch by stretch: samples of one channel
+    were lost, or inserted."""
+    y, model = record.y[estimation], fitted.prediction[estimation]
     parts = stretches(y.size)
     if y.size < 8 * LAGS * len(parts):
         return []  # too short to tell
     lag = np.array([_lag(y[p], model[p]) for p in parts])
-    splits = range(SIDE, lag.size - SIDE + 1)
-    steps = np.array([np.median(lag[n:]) - np.median(lag[:n]) for n in splits])
-    best = int(np.argmax(np.abs(steps)))
-    at = splits[best]
-    spread = np.r_[lag[:at] - np.median(lag[:at]), lag[at:] - np.median(lag[at:])]
-    sigma = 1.4826 * float(np.median(np.abs(spread)))
-    step = float(steps[best])
+
+    def off(at: int) -> FloatArray:
+        both = lag[:at], lag[at:]
+        return np.concatenate([part - np.median(part) for part in both])
+
+    at = min(range(SIDE, lag.size - SIDE + 1), key=lambda n: float(np.sum(np.abs(off(n)))))
+    sigma = 1.4826 * float(np.median(np.abs(off(at))))
+    step = float(np.median(lag[at:]) - np.median(lag[:at]))
     if abs(step) < max(STEP_SIGMAS * sigma, STEP_SAMPLES):
         return []
     when = (estimation.start + parts[at].start) / record.sample_rate_hz
