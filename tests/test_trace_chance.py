@@ -137,6 +137,25 @@ def test_a_law_that_does_better_speaks_against_chance(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_cycle_of_three_numbers_may_follow_what_chance_did(tmp_path: Path) -> None:
+    """Ten runs of a flame that wanders lay on a sine of some period: by luck they looked not quite
+    random, and the sine was claimed, though its numbers had to be tuned for it (100149)."""
+    wander = {"modulation_rms": 0.010088, "corner_hz": 1.28053}
+    made = [make_effect("flame_gain_modulation", wander)]
+    ready = record(
+        tmp_path, 100149, random_rig(100149, modes=MOST_TWO), made, forced=10, validation=3
+    )
+    base = start.fit_from_data(ready.structure, ready.data)
+    cycle = by_key("parameter_drift:flame_gain_cycle")
+    found = trace.search(ready.structure, ready.data, base, catalogue=[cycle, FLAME]).tried
+    best, rivals = trace.claimed([t for t in found if t.explains], found)
+    assert best.key_of_forms == (cycle.key,)
+    assert [t.names for t in rivals] == [("flame_gain_modulation",)]
+    assert rivals[0].objection.startswith("flame_gain_modulation.modulation_rms follows the time")
+    assert rivals[0].evidence > best.evidence
+
+
+@pytest.mark.slow
 def test_a_law_drowned_by_a_modulation_is_sought_beside_it(tmp_path: Path) -> None:
     """The drift of the speaker's gain is not the best of the effects alone, nor the modulation
     enough: it stands out where the modulation has been accounted for."""

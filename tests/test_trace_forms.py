@@ -730,6 +730,35 @@ def test_what_is_far_less_likely_in_a_coarse_form_is_contested_in_a_finer_one(
         asked.clear()
 
 
+@pytest.mark.parametrize(
+    ("left", "asked"),
+    [
+        (1.3, {"channel_mismatch:skew", "channel_mismatch:phase"}),  # as many numbers, none finer
+        (0.55, set()),  # named as a rival
+    ],
+)
+def test_what_would_be_dismissed_is_tried_in_other_forms_first(
+    left: float, asked: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A late microphone beside a gross loss had been taken for its high-pass, which held-out runs
+    spoke against: a high-pass of both was claimed (100131)."""
+    new: set[str] = set()
+
+    def exchanged(items: Sequence[Any], data: Dataset, run: Any) -> list[trace.Tried]:
+        new.update(form.key for *_, form, _ in items)
+        return []
+
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    monkeypatch.setattr(contests, "exchanged", exchanged)
+    loss = "nonlinear_damping:quadratic"
+    both = tried_as(fitted(13, 0.5), loss, "sensor_dynamics:highpass")
+    one = tried_as(fitted(13, left), loss, "channel_mismatch:highpass")
+    keys = ("highpass", "skew", "phase", "gain_phase", "skew_lowpass")
+    forms = [by_key(f"channel_mismatch:{form}") for form in keys]
+    contests.of_the_dismissed([both, one], Dataset((), (), 0.0), forms, InProcess())
+    assert new == asked
+
+
 @pytest.mark.parametrize("form", ["tanh_gain", "arctan_gain", "quadratic_odd"])
 def test_characteristics_and_their_derivatives(form: str) -> None:
     effect = by_key(f"nonlinearity_shape:{form}")

@@ -119,7 +119,10 @@ def _chance_rivals(spread: Tried, best: Tried) -> bool:
     if best.spread is not None:
         return spread.plausible and (spread.adequate or len(spread.effects) == 1)
     random = spread.objection in ("", BEATEN)
-    return spread.adequate and spread.evidence < best.evidence + (EVIDENCE if random else 0.0)
+    less = spread.evidence - best.evidence
+    if best.follows_runs:  # its numbers tuned, too (100149, a cycle of three that modulation made)
+        less = min(less, _tuned_less(spread, best))
+    return spread.adequate and less < (EVIDENCE if random else 0.0)
 
 
 def other_forms(best: Tried, others: Sequence[Tried]) -> dict[str, tuple[str, ...]]:

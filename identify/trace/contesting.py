@@ -11,6 +11,7 @@ from identify.trace.contests import (
     at_the_same_place,
     in_finer_forms,
     in_their_places,
+    of_the_dismissed,
     reformed,
     runners_up,
     varied,
@@ -59,6 +60,7 @@ def _contest_once(going: UnderWay) -> None:
     going.tried += beside_the_same_chance(going.tried, data, going.apart, run, going.report)
     going.tried += within_other_chance(going)
     going.tried += in_finer_forms(going.tried, data, going.forms, run)
+    going.tried += of_the_dismissed(going.tried, data, going.forms, run)
     going.tried += settled(going.tried, data, run)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from identify.dataset import Dataset
 from identify.effect import Effect
 from identify.executor import Executor, Progress
+from identify.trace.claims import claimed
 from identify.trace.exchange import Exchange, exchanged, forms_in_place, in_each_form, joins
 from identify.trace.fewer import eliminate, part_of, with_fewer
 from identify.trace.stages import try_effects
@@ -166,6 +167,28 @@ def in_finer_forms(
         behind = t.key != best.key and not best.parts < t.parts
         if behind and t.evidence >= best.evidence + EVIDENCE:
             items += forms_in_place(t, data, finer, done)
+    return exchanged(items, data, run)
+
+
+def of_the_dismissed(
+    tries: Sequence[Tried], data: Dataset, available: Sequence[Effect], run: Executor
+) -> list[Tried]:
+    """Several effects that explain the data, and that all runs call less likely than what would be
+    claimed, in other forms of as many numbers: a search of sets refits but the forms that seem best
+    on the fitted runs (100131, a late microphone as its high-pass, behind that of both)."""
+    good = [t for t in tries if t.explains and t.spread is None]
+    if not good:
+        return []
+    best, rivals = claimed(good, good)
+    named = {t.key for t in (best, *rivals)}
+    done = {t.key_of_forms for t in tries if t.adequate}
+    items = [
+        item
+        for t in best_by_name(good)
+        if len(t.effects) > 1 and t.key not in named and not best.parts < t.parts
+        for item in forms_in_place(t, data, available, done)
+        if not item[3].refines and len(item[3].parameters) == len(item[2].parameters)
+    ]
     return exchanged(items, data, run)
 
 
