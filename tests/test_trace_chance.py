@@ -1,5 +1,6 @@
 """What deviates from run to run by chance: alone, beside a law, and told from one."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,14 @@ from identify.fit import Fit, fit_orbits
 from identify.identification import Prepared
 from identify.parameters import Estimate
 from identify.scatter import Spread, fit_scatter
-from identify.trace import chance_steps
+from identify.trace import chance_steps, contesting
 from identify.trace.beside_chance import other_forms_beside_chance, without_law
 from identify.trace.claims import against_chance
 from identify.trace.places import deviating, whereabouts
 from identify.trace.scores import chance_test
 from identify.trace.spreads import try_scatters
 from identify.trace.tried import tried
+from identify.trace.under_way import UnderWay
 from simulated_rig.effects import make_effect
 from simulated_rig.random_rigs import MOST_TWO, random_rig
 from tests.trace_material import (
@@ -434,6 +436,35 @@ def test_a_law_beside_a_spread_must_gain_on_the_spread_alone(
     spread = Spread(beside, of_runs(100), sizes, penalty, "")
     both = trace.Tried((*law.effects, FLAME), beside, error, 0.5, 0.5, spread)
     assert trace.accounts(both, far, [law, alone, both]) is claimed
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_before_a_law_beside_chance_is_claimed_other_laws_are_tried_in_other_forms(
+    beside: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A flame that saturates, and a side resonator: of other forms that pair left thousands of
+    times the noise, and a drive that scatters was claimed in the resonator's place (100254)."""
+    asked: list[trace.Tried] = []
+
+    def reformed(found: Sequence[trace.Tried], *rest: Any) -> list[trace.Tried]:
+        asked.extend(found)
+        return []
+
+    law, far = tried_as(fitted(12, 6e4), "nonlinearity_shape:tanh"), fitted(11, 1e7)
+    both = tried_as(
+        fitted(15, 6e3), "nonlinearity_shape:quintic", "acoustic_mode:side_resonator_mode"
+    )
+    fit = fitted(12, 0.5)
+    spread = Spread(fit, of_runs(100), {"x": Estimate(0.01, 0.002, "1")}, 100.0, "")
+    effects = (*law.effects, DRIVE) if beside else (DRIVE,)
+    monkeypatch.setattr(trace.Tried, "plausible", True)
+    monkeypatch.setattr(UnderWay, "accounted", True)
+    monkeypatch.setattr(contesting, "_contest_once", lambda going: None)
+    monkeypatch.setattr(contesting, "reformed", reformed)
+    going = searching(far)
+    going.tried = [law, both, trace.Tried(effects, fit, 1e-3, 0.5, 0.5, spread)]
+    contesting.contest(going)
+    assert asked == ([both] if beside else [])
 
 
 @pytest.mark.parametrize(("penalty", "rival"), [(100.0, True), (300.0, False)])

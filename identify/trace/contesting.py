@@ -30,13 +30,16 @@ DOUBT = 0.05  # … and of what it leaves, below which either is tried whatever 
 
 def contest(going: UnderWay) -> None:
     """What might do as well as the best is tried before it is claimed, and, where nothing can
-    be, the foremost of what does not explain the data in other forms."""
+    be, or a law beside chance alone, the foremost of what does not explain the data in other forms
+    (100254, a side resonator beside a flame that saturates, of which other forms left thousands of
+    times the noise: a drive that scatters had stood for it)."""
     for seek in (reformed, varied):
         if going.seeking():
             going.tried += seek(going.laws, going.data, going.forms, going.run, going.done)
     _contest_once(going)
     first = foremost([t for t in going.laws if t.plausible])
-    if going.explained and not going.accounted and first is not None and not first.explains:
+    sure = going.accounted and (going.by_law or going.by_chance)
+    if going.explained and not sure and first is not None and not first.explains:
         going.report(0.95, "trying other forms of the foremost")
         others = reformed([first], going.data, going.forms, going.run, going.done)
         going.tried += others
