@@ -43,8 +43,8 @@ def _repeated(y: FloatArray) -> FloatArray:
     return out
 
 
-def _lost(y: FloatArray) -> FloatArray:
-    return np.r_[y[:3000], y[3003:], y[:3]]
+def _lost(y: FloatArray, samples: int = 3) -> FloatArray:
+    return np.r_[y[:3000], y[3000 + samples :], y[:samples]]
 
 
 def _knocked(y: FloatArray) -> FloatArray:
@@ -111,11 +111,7 @@ def _flagged(lost: int, cubic: float, times: int = 2) -> tuple[list[str], list[s
     u = _sweep(4 * PERIOD, times)
     y = duffing_output(u, cubic=cubic)
     y = y + 3e-4 * np.random.default_rng(8).standard_normal(y.size)
-    y = np.r_[y[:3000], y[3000 + lost :], y[:lost]]
-    found = diagnose_broadband(
-        u, y, RATE, declared="linear", title="one",
-        estimation=slice(300, 3 * PERIOD), test=slice(3 * PERIOD, 4 * PERIOD),
-    )  # fmt: skip
+    found = _diagnosed(u, _lost(y, lost))
     excluded = [q.flag for q in found.quality if q.severity == "excluded"]
     return excluded, [w.score.candidate.kind for w in found.claims], found.verdict
 

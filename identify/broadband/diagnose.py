@@ -296,10 +296,11 @@ def _linear(record: Excitation, plain: Whitener) -> Fit:
     fits: list[Fit] = []
     for stiffness, damping in _STARTS:
         start = {"stiffness": -stiffness, "damping": -damping, "input": 1.0, "bias": 0.0}
-        one = plain(record.predict(structure, np.array([start[n] for n in LINEAR]))[0])
+        theta = np.array([start[name] for name in structure.names])
+        one = plain(record.predict(structure, theta, derivatives=False)[0])
         start["input"] = float(one @ y) / float(one @ one)  # of its sign
         fits.append(fit(record, structure, start, plain))
-        if min(f.chi2 for f in fits) < MUCH * float(y @ y):
+        if fits[-1].chi2 < MUCH * float(y @ y):
             break
     return min(fits, key=lambda f: f.chi2)
 

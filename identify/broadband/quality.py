@@ -115,8 +115,8 @@ def _held(record: Excitation, declared: Fit, name: str) -> list[QualityFlag]:
 def _standing(declared: Fit, best: Fit, estimation: slice) -> Fit:
     """The richest model where it leaves far less than the declared one does: past a resonance that
     bends, a linear model is ahead of a sweep by samples. Else what it adds may have gone astray."""
-    left = (np.linalg.norm(f.residual[estimation]) for f in (best, declared))
-    return best if next(left) < FAR_LESS * next(left) else declared
+    left = [float(np.linalg.norm(f.residual[estimation])) for f in (declared, best)]
+    return best if left[1] < FAR_LESS * left[0] else declared
 
 
 def _lost(record: Excitation, fitted: Fit, estimation: slice, name: str) -> list[QualityFlag]:
@@ -128,13 +128,13 @@ def _lost(record: Excitation, fitted: Fit, estimation: slice, name: str) -> list
         return []  # too short to tell
     lag = np.array([_lag(y[p], model[p]) for p in parts])
 
-    def off(at: int) -> FloatArray:
-        both = lag[:at], lag[at:]
-        return np.concatenate([part - np.median(part) for part in both])
-
-    at = min(range(SIDE, lag.size - SIDE + 1), key=lambda n: float(np.sum(np.abs(off(n)))))
-    sigma = 1.4826 * float(np.median(np.abs(off(at))))
-    step = float(np.median(lag[at:]) - np.median(lag[:at]))
+    splits = range(SIDE, lag.size - SIDE + 1)
+    steps = [float(np.median(lag[at:]) - np.median(lag[:at])) for at in splits]
+    off = [
+        np.concatenate([part - np.median(part) for part in (lag[:at], lag[at:])]) for at in splits
+    ]
+    where = int(np.argmin([np.sum(np.abs(x)) for x in off]))
+    at, step, sigma = splits[where], steps[where], 1.4826 * float(np.median(np.abs(off[where])))
     if abs(step) < max(STEP_SIGMAS * sigma, STEP_SAMPLES):
         return []
     when = (estimation.start + parts[at].start) / record.sample_rate_hz

@@ -182,12 +182,16 @@ def of_the_dismissed(
     best, rivals = claimed(good, good)
     named = {t.key for t in (best, *rivals)}
     done = {t.key_of_forms for t in tries if t.adequate}
-    items = [
-        item
+    dismissed = [
+        t
         for t in best_by_name(good)
         if len(t.effects) > 1 and t.key not in named and not best.parts < t.parts
-        for item in forms_in_place(t, data, available, done)
-        if not item[3].refines and len(item[3].parameters) == len(item[2].parameters)
+    ]
+    items = [
+        (t, kept, old, form, data)
+        for t in dismissed
+        for _, kept, old, form, _ in forms_in_place(t, data, available, done)
+        if not form.refines and len(form.parameters) == len(old.parameters)
     ]
     return exchanged(items, data, run)
 
