@@ -99,13 +99,16 @@ def thesis_campaign(
 
 
 def altered_campaign(
-    folder: Path, seed: int, change: Callable[[RecordedRun], RecordedRun]
+    folder: Path,
+    seed: int,
+    change: Callable[[RecordedRun], RecordedRun],
+    effects: Sequence[SealedEffect] = (),
 ) -> Prepared:
     """The thesis's rig, two modes declared, each of its recordings changed; of 24 bits, so that no
     change is lost between two counts."""
     rig = build_config(noise_db=36.0)
     rig = replace(rig, converter=replace(rig.converter, bits=24))
-    return record(folder, seed, rig, [], forced=7, validation=2, change=change)
+    return record(folder, seed, rig, effects, forced=7, validation=2, change=change)
 
 
 def search_for(ready: Prepared, *keys: str) -> tuple[trace.Tried, list[trace.Tried]]:

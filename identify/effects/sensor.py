@@ -61,14 +61,15 @@ class ChannelMismatch(Effect):
     high-pass.
 
     û_measured − û_true = −p̂₂ (1 − 1/g) / (ρ Δx s): common pressure leaks into the velocity. A skew,
-    a phase and a low-pass time above zero are a lag of that microphone.
+    a phase and a low-pass time above zero are a lag of that microphone. Where the lower one lags
+    (``lower_skew``: below zero), both are late against the drive besides.
     """
 
     name, location = "channel_mismatch", "sensor"
     needs = ("pressure",)
 
     def __init__(self, form: str) -> None:
-        self.form = form
+        self.form, self.upper = form, not form.startswith("lower_")
         gain = Parameter("channel_mismatch.gain", "1", -0.9, 9.0, scale=1e-3)
         skew = Parameter("channel_mismatch.skew_s", "s", -1e-2, 1e-2, scale=1e-6)
         phase = Parameter("channel_mismatch.phase_rad", "rad", -1.0, 1.0, scale=1e-3)
@@ -77,6 +78,7 @@ class ChannelMismatch(Effect):
         self.parameters = {
             "gain": (gain,),
             "skew": (skew,),
+            "lower_skew": (skew,),
             "gain_skew": (gain, skew),
             "phase": (phase,),
             "gain_phase": (gain, phase),
@@ -93,10 +95,11 @@ class ChannelMismatch(Effect):
         if "gain" in self.form:  # as of another range of a preamplifier
             gains = (-0.65, -0.35, -0.03, 0.03, 0.5, 1.5, 4.0)  # 3 %: as of two microphones unlike
             return [small, *((gain, *small[1:]) for gain in gains)]
-        if self.form != "skew":
+        if self.form not in ("skew", "lower_skew"):
             return [small]
-        # a delay of either, as of a converter that began later
-        return [small, *((sign * q,) for q in known.delays(cycles=2.0) for sign in (1.0, -1.0))]
+        # as of a multiplexed converter, or of one that began later: of either
+        lags = (1e-5, 3e-5, *known.delays(cycles=2.0))
+        return [small, *((sign * q,) for q in lags for sign in (1.0, -1.0))]
 
     def neutral(self) -> tuple[float, ...]:
         return (0.0,) * len(self.parameters)
@@ -115,15 +118,15 @@ class ChannelMismatch(Effect):
             if q.name.endswith("gain"):
                 inverse = inverse / (value + 1.0)
             elif q.name.endswith("skew_s"):
-                inverse = inverse * dual.exp(s * value)
+                inverse = inverse * dual.exp(s * (value if self.upper else -value))
             elif q.name.endswith("phase_rad"):
                 inverse = inverse * dual.exp(1j * value)
             elif q.name.endswith("highpass_hz"):
                 inverse = inverse * (2 * np.pi * value / s + 1.0)
             else:
                 inverse = inverse * (s * value + 1.0)
-        leak = as_velocity(at, s, upper_pressure(at, s))
-        return with_leak(at, y, leak * (inverse - 1.0))
+        heard = upper_pressure(at, s) if self.upper else -lower_pressure(at, s)
+        return with_leak(at, y, as_velocity(at, s, heard) * (inverse - 1.0))
 
 
 class MicrophoneResonance(Effect):
@@ -357,6 +360,7 @@ class DrivePickup(Effect):
 EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("gain"),
     ChannelMismatch("skew"),
+    ChannelMismatch("lower_skew"),
     ChannelMismatch("gain_skew"),
     ChannelMismatch("phase"),
     ChannelMismatch("gain_phase"),

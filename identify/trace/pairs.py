@@ -29,6 +29,7 @@ ANYWHERE = 64  # … and with several declared modes beside the one that sings
 PLACED = 1500  # values of a pair's effects with places of these modes that are tried at the most
 NEARER = 40  # pairs that come to the second stage …
 NEAREST = 6  # … and that are refitted in full
+VALUES = 6  # of an effect that are tried beside a further mode
 BEST_SINGLES = 3  # whose forms stand for their effects too
 
 #: The forms that stand for the others of their effects; of an effect without one here, the first.
@@ -48,6 +49,7 @@ STANDING = {
     "actuator_dynamics:delay",
     "actuator_nonlinearity:quadratic_cubic",
     "channel_mismatch:gain_skew",
+    "channel_mismatch:lower_skew",
     "parameter_drift:frequency_settling",
     "parameter_drift:several",
 }
@@ -146,8 +148,11 @@ def _lead(pair: _Pair) -> _Led:
     """The pair's starts through the first stage."""
     sought, rough = pair.sought, pair.rough
     if pair.richer is not None:
-        row = pair.effects[1].neutral() or pair.effects[1].starts(pair.known)[0]
-        starts = signed_starts(sought, rough, [row], dense_placements(sought.mode_count - 1))
+        other = pair.effects[1]
+        neutral = other.neutral()
+        rows = [neutral] if neutral else []
+        rows += other.starts(pair.known)[: VALUES - len(rows)]
+        starts = signed_starts(sought, rough, rows, dense_placements(sought.mode_count - 1))
         many = OF_MODES
     elif pair.plain.mode_count > 2:  # the others trade off each other
         starts, many = _anywhere(pair), ANYWHERE
