@@ -62,7 +62,7 @@ class ChannelMismatch(Effect):
 
     û_measured − û_true = −p̂₂ (1 − 1/g) / (ρ Δx s): common pressure leaks into the velocity. A skew,
     a phase and a low-pass time above zero are a lag of that microphone. Where the lower one lags
-    (``lower_skew``: below zero), both are late against the drive besides.
+    (``lower_skew``, ``lower_lowpass``: below zero), both are late against the drive besides.
     """
 
     name, location = "channel_mismatch", "sensor"
@@ -83,6 +83,7 @@ class ChannelMismatch(Effect):
             "phase": (phase,),
             "gain_phase": (gain, phase),
             "lowpass": (lag,),
+            "lower_lowpass": (lag,),
             "highpass": (corner,),
             "gain_lowpass": (gain, lag),
             "gain_highpass": (gain, corner),
@@ -114,11 +115,11 @@ class ChannelMismatch(Effect):
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
         inverse: Any = 1.0
         for q in self.parameters:
-            value = p[q.name]
+            value = p[q.name] if self.upper else -p[q.name]
             if q.name.endswith("gain"):
                 inverse = inverse / (value + 1.0)
             elif q.name.endswith("skew_s"):
-                inverse = inverse * dual.exp(s * (value if self.upper else -value))
+                inverse = inverse * dual.exp(s * value)
             elif q.name.endswith("phase_rad"):
                 inverse = inverse * dual.exp(1j * value)
             elif q.name.endswith("highpass_hz"):
@@ -365,6 +366,7 @@ EFFECTS: tuple[Effect, ...] = (
     ChannelMismatch("phase"),
     ChannelMismatch("gain_phase"),
     ChannelMismatch("lowpass"),
+    ChannelMismatch("lower_lowpass"),
     ChannelMismatch("highpass"),
     ChannelMismatch("gain_lowpass"),
     ChannelMismatch("gain_highpass"),
