@@ -159,8 +159,9 @@ def _lead(pair: _Pair) -> _Led:
     else:
         starts = signed_starts(sought, rough, pair.proposals, pair.placements)
         many = SIDE_BY_SIDE
-    # most of them fall behind at once, but a valley may be long
-    ahead = polish(sought, rough, starts[:many], (FIRST,), 4)[: max(8, many // 4)]
+    # most of them fall behind at once, but a valley may be long: that of a further mode is
+    first = 10 if pair.richer is not None else 4
+    ahead = polish(sought, rough, starts[:many], (FIRST,), first)[: max(8, many // 4)]
     return _Led(pair, tuple(polish(sought, rough, ahead, (FIRST,), 10)[:3]))
 
 
