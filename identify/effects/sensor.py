@@ -56,6 +56,12 @@ def with_leak(at: Conditions, y: Any, leak: Any) -> Any:
     return y * turn + leak
 
 
+def heard_by_one(at: Conditions, s: Any, y: Any, inverse: Any, upper: bool) -> Any:
+    """Prediction where one microphone reads 1/`inverse` times the pressure."""
+    heard = upper_pressure(at, s) if upper else -lower_pressure(at, s)
+    return with_leak(at, y, as_velocity(at, s, heard) * (inverse - 1.0))
+
+
 class ChannelMismatch(Effect):
     """The upper microphone reads g times the pressure: gain, sampling time, phase, low- or
     high-pass.
@@ -126,8 +132,7 @@ class ChannelMismatch(Effect):
                 inverse = inverse * (2 * np.pi * value / s + 1.0)
             else:
                 inverse = inverse * (s * value + 1.0)
-        heard = upper_pressure(at, s) if self.upper else -lower_pressure(at, s)
-        return with_leak(at, y, as_velocity(at, s, heard) * (inverse - 1.0))
+        return heard_by_one(at, s, y, inverse, self.upper)
 
 
 class MicrophoneResonance(Effect):
@@ -159,8 +164,7 @@ class MicrophoneResonance(Effect):
     def sensor(self, p: Values, at: Conditions, s: Any, y: Any) -> Any:
         w = 2 * np.pi * p[self.parameters[0].name]
         inverse = (s / w + 2.0 * p[self.parameters[1].name]) * (s / w) + 1.0
-        heard = upper_pressure(at, s) if self.upper else -lower_pressure(at, s)
-        return with_leak(at, y, as_velocity(at, s, heard) * (inverse - 1.0))
+        return heard_by_one(at, s, y, inverse, self.upper)
 
 
 BENT = {2: ("1/Pa", 1e-2), 3: ("1/Pa²", 1e-4)}  # by the power: a microphone's most, and its unit

@@ -147,21 +147,19 @@ def _named(pair: _Pair) -> str:
 def _lead(pair: _Pair) -> _Led:
     """The pair's starts through the first stage."""
     sought, rough = pair.sought, pair.rough
+    steps = 4  # most starts fall behind at once, but a valley may be long: a further mode's is
     if pair.richer is not None:
         other = pair.effects[1]
         neutral = other.neutral()
-        rows = [neutral] if neutral else []
-        rows += other.starts(pair.known)[: VALUES - len(rows)]
+        rows = [*([neutral] if neutral else []), *other.starts(pair.known)][:VALUES]
         starts = signed_starts(sought, rough, rows, dense_placements(sought.mode_count - 1))
-        many = OF_MODES
+        many, steps = OF_MODES, 10
     elif pair.plain.mode_count > 2:  # the others trade off each other
         starts, many = _anywhere(pair), ANYWHERE
     else:
         starts = signed_starts(sought, rough, pair.proposals, pair.placements)
         many = SIDE_BY_SIDE
-    # most of them fall behind at once, but a valley may be long: that of a further mode is
-    first = 10 if pair.richer is not None else 4
-    ahead = polish(sought, rough, starts[:many], (FIRST,), first)[: max(8, many // 4)]
+    ahead = polish(sought, rough, starts[:many], (FIRST,), steps)[: max(8, many // 4)]
     return _Led(pair, tuple(polish(sought, rough, ahead, (FIRST,), 10)[:3]))
 
 
